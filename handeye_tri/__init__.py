@@ -1,0 +1,1 @@
+"""Hand-eye robot calibration with three points."""

@@ -1,0 +1,155 @@
+"""The three-point rig: a triangle given by two sides and the angle between.
+
+Frame: A is the origin, B lies on +x, C in the half-plane y > 0, z is the normal.
+Source of the description: Zhao, Liu and Zhang 2008, Sec. II-B
+(doi:10.1109/TIP.2008.2005562).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handeye_tri.errors import InputError
+from handeye_tri.se3 import SE3
+
+Floats = NDArray[np.float64]
+Axis = Literal["normal", "AB", "BC", "CA"]
+AXES: tuple[Axis, ...] = get_args(Axis)
+VERTICES = ("A", "B", "C")
+# The two vertices on each edge, as rows of TriangleRig.points.
+EDGES: dict[str, tuple[int, int]] = {"AB": (0, 1), "BC": (1, 2), "CA": (2, 0)}
+# Flatter than this, the three points are as good as collinear.
+_MIN_ANGLE = np.radians(1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class TriangleRig:
+    """Three noncollinear points A, B, C.
+
+    Attributes:
+        side_ab: |AB|, metres.
+        side_ac: |AC|, metres.
+        angle: Angle at A, radians, in (0, pi).
+    """
+
+    side_ab: float
+    side_ac: float
+    angle: float
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless this is a proper triangle."""
+        for name in ("side_ab", "side_ac"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"{name} must be a positive length, got {value} m")
+        if not np.isfinite(self.angle) or not 0 < self.angle < np.pi:
+            raise InputError(
+                f"angle must lie between 0 and pi radians, got {self.angle}; "
+                "degrees must be converted first"
+            )
+        flattest = min(self.angles)
+        if flattest < _MIN_ANGLE:
+            raise InputError(
+                f"A, B and C are nearly collinear: the smallest angle is "
+                f"{np.degrees(flattest):.3f} degrees (needs at least 1); "
+                "move one marker off the line"
+            )
+
+    @classmethod
+    def from_points(cls, points: ArrayLike) -> TriangleRig:
+        """Triangle through measured A, B, C, shape (3, 3) or (3, 2), metres."""
+        a, b, c = np.asarray(points, dtype=float)
+        ab, ac = b - a, c - a
+        lengths = float(np.linalg.norm(ab)), float(np.linalg.norm(ac))
+        if min(lengths) == 0:
+            raise InputError("two of A, B and C coincide; give three distinct points")
+        cosine = np.clip(ab @ ac / (lengths[0] * lengths[1]), -1, 1)
+        return cls(*lengths, float(np.arccos(cosine)))
+
+    @property
+    def points(self) -> Floats:
+        """A, B, C in the triangle's frame, shape (3, 3), metres."""
+        return np.array(
+            [
+                [0.0, 0.0, 0.0],
+                [self.side_ab, 0.0, 0.0],
+                [
+                    self.side_ac * np.cos(self.angle),
+                    self.side_ac * np.sin(self.angle),
+                    0.0,
+                ],
+            ]
+        )
+
+    @property
+    def side_bc(self) -> float:
+        """|BC|, metres, by the law of cosines."""
+        square = (
+            self.side_ab**2
+            + self.side_ac**2
+            - 2 * self.side_ab * self.side_ac * np.cos(self.angle)
+        )
+        return float(np.sqrt(max(square, 0.0)))
+
+    @property
+    def angles(self) -> tuple[float, float, float]:
+        """Angles at A, B and C, radians."""
+        at_b = float(
+            np.arctan2(
+                self.side_ac * np.sin(self.angle),
+                self.side_ab - self.side_ac * np.cos(self.angle),
+            )
+        )
+        return self.angle, at_b, np.pi - self.angle - at_b
+
+    @property
+    def circumcentre(self) -> Floats:
+        """Point at equal distance from A, B and C, shape (2,), metres."""
+        _, b, c = self.points[:, :2]
+        solution = np.linalg.solve(np.array([b, c]), 0.5 * np.array([b @ b, c @ c]))
+        return np.asarray(solution)
+
+    def half_turn(self, axis: Axis, o: ArrayLike | None = None) -> SE3:
+        """The 180-degree rotation about an axis, in the triangle's frame.
+
+        Args:
+            axis: "normal", or the edge "AB", "BC" or "CA".
+            o: For "normal": where the axis meets the plane, shape (2,), metres.
+
+        Returns:
+            ``before_from_after``: the triangle's frame after the turn, seen in its
+            frame before the turn. A half-turn is its own inverse.
+
+        Raises:
+            InputError: the axis is unknown, or "normal" comes without ``o``.
+        """
+        if axis == "normal":
+            if o is None:
+                raise InputError('half_turn("normal") needs o, the foot of the axis')
+            direction = np.array([0.0, 0.0, 1.0])
+            through = np.append(np.asarray(o, dtype=float), 0.0)
+        elif axis in EDGES:
+            start, end = self.points[list(EDGES[axis])]
+            direction = (end - start) / np.linalg.norm(end - start)
+            through = start
+        else:
+            raise InputError(f"axis must be one of {', '.join(AXES)}, got {axis!r}")
+        rotation = 2.0 * np.outer(direction, direction) - np.eye(3)
+        return SE3.from_parts(rotation, through - rotation @ through)
+
+    def foot(self, axis: Axis) -> Floats:
+        """Where the third vertex' perpendicular meets an edge axis, shape (2,).
+
+        This is the paper's D (Sec. III-B) for B and axis AC, in metres.
+        """
+        if axis not in EDGES:
+            raise InputError(f"foot needs an edge, got {axis!r}")
+        first, second = EDGES[axis]
+        third = 3 - first - second
+        start, end, apex = self.points[[first, second, third], :2]
+        along = (end - start) / np.linalg.norm(end - start)
+        return np.asarray(start + along * ((apex - start) @ along))
