@@ -1,0 +1,139 @@
+"""Synthetic sessions: exact projection, stated noise, the promised geometry."""
+
+import numpy as np
+import pytest
+
+from handeye_tri.camera import Lens
+from handeye_tri.errors import InputError, NoPlanError
+from handeye_tri.records import Repeatability
+from handeye_tri.se3 import se3_inverse, se3_log
+from handeye_tri.synthesize import reference_geometry, synthesize
+
+
+@pytest.mark.parametrize("axis", ["normal", "AB", "BC", "CA"])
+def test_half_turns_map_the_triangle_as_its_axis_says(axis):
+    geometry = reference_geometry(np.random.default_rng(3), axis=axis)
+    assert len(geometry.stations) == 28
+    assert [s.kind for s in geometry.stations].count("evaluation") == 6
+    base_from_triangle = np.array(
+        [
+            (s.base_from_flange @ geometry.flange_from_triangle).matrix
+            for s in geometry.stations
+        ]
+    )
+    o = geometry.triangle.circumcentre if axis == "normal" else None
+    expected = geometry.triangle.half_turn(axis, o).matrix
+    for turn in geometry.half_turns:
+        relative = (
+            se3_inverse(base_from_triangle[turn.before])
+            @ base_from_triangle[turn.after]
+        )
+        np.testing.assert_allclose(relative, expected, atol=1e-14)
+        assert turn.axis == axis
+
+
+def test_successive_planes_are_twenty_degrees_apart():
+    for seed in range(5):
+        geometry = reference_geometry(np.random.default_rng(seed))
+        normals = np.array(
+            [
+                (s.base_from_flange @ geometry.flange_from_triangle).rotation[:, 2]
+                for s in geometry.stations[:22:2]
+            ]
+        )
+        cosines = np.abs((normals[1:] * normals[:-1]).sum(axis=1))
+        assert np.degrees(np.arccos(cosines.max())) >= 20
+
+
+def test_exact_pixels_are_the_projection_of_the_chain():
+    lens = Lens("radtan", np.array([-0.1, 0.05, 1e-3, -5e-4, 0.0]))
+    geometry = reference_geometry(np.random.default_rng(0), skew=1.5, lens=lens)
+    session, truth = synthesize(
+        geometry,
+        np.random.default_rng(1),
+        sigma_px=0.0,
+        repeatability=Repeatability(1e-4, 1e-3),
+    )
+    for i, camera in enumerate(geometry.cameras):
+        for j in (0, 7, 27):
+            chain = (
+                se3_inverse(geometry.base_from_camera[i].matrix)
+                @ truth.base_from_flange[j]
+                @ geometry.flange_from_triangle.matrix
+            )
+            points = geometry.triangle.points @ chain[:3, :3].T + chain[:3, 3]
+            np.testing.assert_allclose(
+                session.pixels[i, j], camera.project(points), atol=1e-10
+            )
+    assert session.cameras[0].lens == ("k1", "k2", "p1", "p2")
+
+
+def test_outline_centre_of_a_sphere_is_that_of_its_tangent_cone():
+    geometry = reference_geometry(np.random.default_rng(0))
+    session, truth = synthesize(
+        geometry, np.random.default_rng(1), sigma_px=0.0, marker_radii=(8e-3,) * 3
+    )
+    camera = geometry.cameras[0]
+    chain = (
+        se3_inverse(geometry.base_from_camera[0].matrix)
+        @ truth.base_from_flange[4]
+        @ geometry.flange_from_triangle.matrix
+    )
+    x = geometry.triangle.points[1] @ chain[:3, :3].T + chain[:3, 3]
+    # Silhouette of |p| = r around x, found without the closed formula: tangent rays
+    # touch the sphere on a circle; its image is an ellipse, whose centre is the mean
+    # of opposite tangency extremes along each image axis of the bounding box.
+    normal = x / np.linalg.norm(x)
+    side = np.cross(normal, (0.3, 0.1, 0.9))
+    side /= np.linalg.norm(side)
+    up = np.cross(normal, side)
+    distance = np.linalg.norm(x)
+    centre = x * (1 - (8e-3 / distance) ** 2)
+    radius = 8e-3 * np.sqrt(1 - (8e-3 / distance) ** 2)
+    angle = np.linspace(0, 2 * np.pi, 20001)[:, None]
+    circle = centre + radius * (np.cos(angle) * side + np.sin(angle) * up)
+    outline = camera.project(circle)
+    box_centre = 0.5 * (outline.max(axis=0) + outline.min(axis=0))
+    np.testing.assert_allclose(session.pixels[0, 4, 1], box_centre, atol=1e-5)
+    assert np.linalg.norm(box_centre - camera.project(x)) > 1e-3
+
+
+def test_noise_has_the_stated_size_and_does_not_move_with_the_sigma():
+    geometry = reference_geometry(
+        np.random.default_rng(0), half_turns=40, evaluation_stations=40
+    )
+    rng = np.random.default_rng
+    repeat = Repeatability(3e-5, 1e-4)
+    exact, _ = synthesize(geometry, rng(5), sigma_px=0.0, repeatability=repeat)
+    noisy, truth = synthesize(geometry, rng(5), sigma_px=0.1, repeatability=repeat)
+    difference = noisy.pixels - exact.pixels
+    # 720 numbers: the standard deviation is known to 1/sqrt(2 * 720) = 2.6 %.
+    assert 0.09 < difference.std() < 0.11
+    tangent = se3_log(se3_inverse(noisy.base_from_flange) @ truth.base_from_flange)
+    assert 2.7e-5 < tangent[:, :3].std() < 3.3e-5
+    assert 0.9e-4 < tangent[:, 3:].std() < 1.1e-4
+    np.testing.assert_allclose(noisy.pixel_covariance[0, 0, 0], 0.01 * np.eye(2))
+
+
+def test_same_seed_same_session():
+    pair = [
+        synthesize(
+            reference_geometry(np.random.default_rng(9)),
+            np.random.default_rng(9),
+            sigma_px=0.1,
+        )[0]
+        for _ in range(2)
+    ]
+    np.testing.assert_array_equal(pair[0].pixels, pair[1].pixels)
+
+
+def test_bad_input_is_named():
+    geometry = reference_geometry(np.random.default_rng(0), half_turns=2)
+    rng = np.random.default_rng(0)
+    with pytest.raises(InputError, match="sigma_px"):
+        synthesize(geometry, rng, sigma_px=-1.0)
+    with pytest.raises(InputError, match="marker_radii"):
+        synthesize(geometry, rng, sigma_px=0.1, marker_radii=(1.0, -1.0, 0.0))
+    with pytest.raises(NoPlanError, match="farther away") as caught:
+        reference_geometry(rng, distance=0.3)
+    assert caught.value.rejected["view"] > 0
