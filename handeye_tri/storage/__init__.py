@@ -1,0 +1,32 @@
+"""Sessions, results and cell descriptions on disk; the only reader and writer."""
+
+from handeye_tri.storage.cells import find_cell, find_model, read_cell, shipped
+from handeye_tri.storage.files import (
+    read_arrays,
+    read_image,
+    read_json,
+    sha256,
+    write_arrays,
+    write_bytes,
+    write_image,
+    write_json,
+)
+from handeye_tri.storage.folder import SessionFolder, decoded, fingerprint
+
+__all__ = [
+    "SessionFolder",
+    "decoded",
+    "find_cell",
+    "find_model",
+    "fingerprint",
+    "read_arrays",
+    "read_cell",
+    "read_image",
+    "read_json",
+    "sha256",
+    "shipped",
+    "write_arrays",
+    "write_bytes",
+    "write_image",
+    "write_json",
+]
