@@ -1,0 +1,101 @@
+"""The rods that hold the three markers on the flange, from the cell's rig."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handeye_tri.errors import InputError
+
+if TYPE_CHECKING:
+    from handeye_tri.config import RigConfig
+
+Floats = NDArray[np.float64]
+
+# How far behind the markers the rods run across, so that they hide none at a tilt.
+_STANDOFF = 0.045
+# An edge rig is seen from both faces and along its plane: thin rods.
+_ROD_RADIUS = 0.0025
+_HUB_RADIUS = 0.009
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rod:
+    """A straight round rod.
+
+    Attributes:
+        name: What it holds.
+        radius: Metres.
+        start: Centre of one end in the flange frame, shape (3,), metres.
+        end: Centre of the other end, likewise.
+    """
+
+    name: str
+    radius: float
+    start: Floats
+    end: Floats
+
+
+def rig_rods(rig: RigConfig) -> tuple[Rod, ...]:
+    """Rods of a rig, in the flange frame.
+
+    A normal rig is a star behind the triangle's plane with a standoff to every
+    marker. An edge rig is a flat fork in that plane whose tines reach every marker
+    from the flange's side, so that a marker shows from both faces.
+
+    Raises:
+        InputError: an edge rig's third marker lies behind the fork's cross bar.
+    """
+    markers = rig.flange_from_triangle.apply(rig.triangle.points)
+    bar = max(1e-3 * rig.ahead_mm - _STANDOFF, 0.5e-3 * rig.ahead_mm)
+    centre = np.array([0.0, 0.0, bar])
+    hub = Rod("hub", _HUB_RADIUS, np.zeros(3), centre)
+    if rig.axis == "normal":
+        return (hub, *_star(markers, centre))
+    start = {"AB": 0, "BC": 1, "CA": 2}[rig.axis]
+    order = [(start + k) % 3 for k in range(3)]
+    side = markers[order[2]]
+    if side[2] < bar + 2e-3 * max(rig.marker_radii_mm):
+        raise InputError(
+            f"rig.ahead_mm: marker {'ABC'[order[2]]} would lie behind the fork that "
+            f"holds it, {1e3 * side[2]:.0f} mm from the flange; choose another edge "
+            f"as the axis or an angle below 90 degrees, got ahead_mm {rig.ahead_mm:g}"
+        )
+    clear = 1e-3 * rig.marker_radii_mm[order[0]] + 0.012
+    return (hub, *_fork(markers[order], order, centre, clear))
+
+
+def _star(markers: Floats, centre: Floats) -> list[Rod]:
+    rods = []
+    for name, marker in zip("ABC", markers, strict=True):
+        foot = np.array([marker[0], marker[1], centre[2]])
+        rods.append(Rod(f"arm {name}", 1.6 * _ROD_RADIUS, centre, foot))
+        rods.append(Rod(f"standoff {name}", 1.2 * _ROD_RADIUS, foot, marker))
+    return rods
+
+
+def _fork(markers: Floats, order: list[int], centre: Floats, clear: float) -> list[Rod]:
+    """Rods to the near and the far marker of the axis and to the one beside it."""
+    near, far, side = markers
+    across = np.array([side[0], side[1], 0.0])
+    across /= np.linalg.norm(across)
+
+    def at(lateral: float, height: float) -> Floats:
+        return np.asarray(lateral * across + (0.0, 0.0, height))
+
+    # The far marker's tine passes the near marker at a distance, then turns in.
+    bend = at(-clear, far[2] - clear)
+    ends: list[tuple[str, ArrayLike, ArrayLike]] = [
+        ("bar", at(-clear, centre[2]), at(side @ across, centre[2])),
+        (f"tine {'ABC'[order[0]]}", centre, near),
+        (f"tine {'ABC'[order[1]]}", at(-clear, centre[2]), bend),
+        (f"tip {'ABC'[order[1]]}", bend, far),
+        (f"tine {'ABC'[order[2]]}", at(side @ across, centre[2]), side),
+    ]
+    return [
+        Rod(name, _ROD_RADIUS, np.asarray(start), np.asarray(end))
+        for name, start, end in ends
+    ]
