@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 # Below this angle the closed-form coefficients lose digits to cancellation; the
 # first term left out of the series, angle^8 / 9!, is 3e-14 of the last one there.
 _SMALL_ANGLE = 0.1
+# The same for coefficients that divide by angle^5.
+_SMALL_ANGLE_Q = 0.4
 # A matrix whose R'R is farther than this from the identity is no rotation.
 _ROTATION_TOLERANCE = 1e-6
 
@@ -264,6 +266,67 @@ def se3_inverse(matrix: ArrayLike) -> Floats:
     return result
 
 
+def se3_left_jacobian_inverse(tangent: ArrayLike) -> Floats:
+    """Inverse of the left Jacobian of SE(3).
+
+    ``log(exp(d) exp(x)) ~ x + J^-1 d``; the right one is this at ``-x``. Formulas:
+    Barfoot 2017, Eq. 7.86 and 7.95, for tangents (translation, rotation).
+
+    Args:
+        tangent: Shape (..., 6), metres and radians, rotation below 2 pi.
+
+    Returns:
+        Shape (..., 6, 6).
+    """
+    xi = np.asarray(tangent, dtype=float)
+    rho, phi = hat(xi[..., :3]), hat(xi[..., 3:])
+    angle = np.linalg.norm(xi[..., 3:], axis=-1)
+    square = angle * angle
+    small = angle < _SMALL_ANGLE_Q
+    safe = np.where(small, 1.0, angle)
+    _, _, first = _series(angle)
+    second = np.where(
+        small,
+        1 / 24 - square / 720 * (1 - square / 56 * (1 - square / 90)),
+        (safe**2 + 2 * np.cos(safe) - 2) / (2 * safe**4),
+    )
+    third = np.where(
+        small,
+        1 / 120 - square / 2520 * (1 - square / 48 * (1 - square * 2 / 165)),
+        (2 * safe - 3 * np.sin(safe) + safe * np.cos(safe)) / (2 * safe**5),
+    )
+    phi_rho, rho_phi = phi @ rho, rho @ phi
+    phi_rho_phi = phi_rho @ phi
+    coupling = (
+        0.5 * rho
+        + first[..., None, None] * (phi_rho + rho_phi + phi_rho_phi)
+        + second[..., None, None] * (phi @ phi_rho + rho_phi @ phi - 3 * phi_rho_phi)
+        + third[..., None, None] * (phi_rho_phi @ phi + phi @ phi_rho_phi)
+    )
+    inverse = so3_left_jacobian_inverse(xi[..., 3:])
+    result = np.zeros((*xi.shape[:-1], 6, 6))
+    result[..., :3, :3] = result[..., 3:, 3:] = inverse
+    result[..., :3, 3:] = -inverse @ coupling @ inverse
+    return result
+
+
+def se3_adjoint(matrix: ArrayLike) -> Floats:
+    """Adjoints of rigid-motion matrices: ``T exp(x) T^-1 == exp(adjoint @ x)``.
+
+    Args:
+        matrix: Shape (..., 4, 4).
+
+    Returns:
+        Shape (..., 6, 6), for tangents (translation, rotation).
+    """
+    m = np.asarray(matrix, dtype=float)
+    rotation = m[..., :3, :3]
+    result = np.zeros((*m.shape[:-2], 6, 6))
+    result[..., :3, :3] = result[..., 3:, 3:] = rotation
+    result[..., :3, 3:] = hat(m[..., :3, 3]) @ rotation
+    return result
+
+
 class SE3:
     """An immutable rigid motion, named ``a_from_b`` where it is used.
 
@@ -372,10 +435,7 @@ class SE3:
 
     def adjoint(self) -> Floats:
         """Shape (6, 6): ``T exp(x) T^-1 == exp(adjoint @ x)``."""
-        result = np.zeros((6, 6))
-        result[:3, :3] = result[3:, 3:] = self.rotation
-        result[:3, 3:] = hat(self.translation) @ self.rotation
-        return result
+        return se3_adjoint(self.matrix)
 
     def apply(self, points: ArrayLike) -> Floats:
         """Map points, shape (..., 3), metres, from b to a."""

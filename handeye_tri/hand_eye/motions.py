@@ -1,0 +1,148 @@
+"""Poses as input: checks, relative motions, and rotation vectors that match at pi."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handeye_tri.errors import InputError
+from handeye_tri.se3 import quaternion_wxyz, se3_inverse
+
+Floats = NDArray[np.float64]
+
+# A matrix whose R'R is farther than this from the identity is no rotation.
+_ROTATION_TOLERANCE = 1e-6
+
+
+def check_motions(name: str, motions: ArrayLike, least: int) -> Floats:
+    """Read rigid motions and refuse what is none.
+
+    Args:
+        name: What the message calls them.
+        motions: Shape (n, 4, 4), metres.
+        least: The smallest n that can be used.
+
+    Returns:
+        Shape (n, 4, 4), a copy.
+
+    Raises:
+        InputError: wrong shape, too few, not finite, or not rigid; the message
+            names the first bad index and says how far off it is.
+    """
+    m = np.array(motions, dtype=float)
+    if m.ndim != 3 or m.shape[1:] != (4, 4):
+        raise InputError(f"{name} must have shape (n, 4, 4), got {m.shape}")
+    if len(m) < least:
+        raise InputError(f"{name} holds {len(m)} motions; at least {least} are needed")
+    bad = ~np.isfinite(m).all(axis=(1, 2))
+    if bad.any():
+        raise InputError(
+            f"{name}[{np.argmax(bad)}] holds NaN or infinity "
+            f"({bad.sum()} of {len(m)} do); drop those pairs first"
+        )
+    last = np.abs(m[:, 3] - (0, 0, 0, 1)).max(axis=1)
+    if last.max() > 1e-9:
+        i = int(np.argmax(last))
+        raise InputError(
+            f"{name}[{i}]: the last row must be (0, 0, 0, 1), got {m[i, 3].tolist()}; "
+            "matrices are row-major with the translation in the last column"
+        )
+    r = m[:, :3, :3]
+    defect = np.abs(np.swapaxes(r, 1, 2) @ r - np.eye(3)).max(axis=(1, 2))
+    determinant = np.linalg.det(r)
+    wrong = (defect > _ROTATION_TOLERANCE) | (determinant < 0)
+    if wrong.any():
+        i = int(np.argmax(np.where(determinant < 0, np.inf, defect)))
+        raise InputError(
+            f"{name}[{i}] is not a rotation: R'R differs from I by {defect[i]:.2g} "
+            f"(allowed {_ROTATION_TOLERANCE:g}), determinant {determinant[i]:+.6f}; "
+            "orthonormalise it first (handeye_tri.se3.nearest_rotation)"
+        )
+    return m
+
+
+def check_pairs(a: ArrayLike, b: ArrayLike, least: int) -> tuple[Floats, Floats]:
+    """Read two lists of motions that belong together, see :func:`check_motions`.
+
+    Raises:
+        InputError: a list is unusable, or their lengths differ.
+    """
+    first, second = check_motions("a", a, least), check_motions("b", b, least)
+    if len(first) != len(second):
+        raise InputError(
+            f"a holds {len(first)} motions and b {len(second)}; "
+            "a[i] and b[i] must belong together"
+        )
+    return first, second
+
+
+def relative_motions(
+    poses: ArrayLike,
+    *,
+    pairs: Literal["all", "successive"] = "all",
+    side: Literal["left", "right"] = "left",
+) -> Floats:
+    """Motions between stations, from absolute poses.
+
+    With ``a_i x = z b_i``, left motions ``a_j a_i^-1`` and ``b_j b_i^-1`` satisfy
+    AX = XB with ``z`` for X; right motions ``a_i^-1 a_j`` and ``b_i^-1 b_j`` with
+    ``x`` for X. So a standing camera (z = base_from_camera) takes the left ones.
+
+    Args:
+        poses: Shape (n, 4, 4), metres.
+        pairs: Every pair i < j, n (n - 1) / 2 of them, or n - 1 successive pairs.
+        side: Which of the two.
+
+    Returns:
+        Shape (number of pairs, 4, 4); pairs in lexical order.
+    """
+    m = check_motions("poses", poses, 2)
+    i, j = (
+        np.triu_indices(len(m), 1)
+        if pairs == "all"
+        else (np.arange(len(m) - 1), np.arange(1, len(m)))
+    )
+    inverse = se3_inverse(m)
+    result = m[j] @ inverse[i] if side == "left" else inverse[i] @ m[j]
+    return np.asarray(result)
+
+
+def matched_quaternions(
+    a: Floats, b: Floats, rotation: Floats
+) -> tuple[Floats, Floats]:
+    """Unit quaternions of paired rotations, with the sign at pi settled.
+
+    A quaternion and its negative are the same rotation. The habit w >= 0 makes the
+    choice unique except near a half-turn, where noise decides for each of a and b
+    alone and every second pair comes out with opposite axes. Here a's sign is the
+    one whose axis is on the side of R b's axis wherever the turn exceeds a right
+    angle; below that, w >= 0 is safe.
+
+    Args:
+        a: Rotations, shape (n, 3, 3).
+        b: Rotations, shape (n, 3, 3).
+        rotation: An estimate of the R in ``a = R b R'``, shape (3, 3).
+
+    Returns:
+        Quaternions (w, x, y, z) of a and of b, shape (n, 4) each.
+    """
+    qa, qb = quaternion_wxyz(a), quaternion_wxyz(b)
+    opposite = (qa[:, 1:] * (qb[:, 1:] @ rotation.T)).sum(axis=1) < 0
+    qa[opposite & (qb[:, 0] < np.sqrt(0.5))] *= -1.0
+    return qa, qb
+
+
+def rotation_vectors(quaternions: Floats) -> Floats:
+    """Rotation vectors, shape (n, 3), of quaternions that may have w < 0.
+
+    The norm is in [0, 2 pi): a quaternion with w < 0 stands for a turn beyond pi,
+    so that vectors vary smoothly through a half-turn.
+    """
+    w, v = quaternions[:, 0], quaternions[:, 1:]
+    sine = np.linalg.norm(v, axis=1)
+    small = sine < 1e-8
+    safe = np.where(small, 1.0, sine)
+    factor = np.where(small, 2.0, 2.0 * np.arctan2(safe, w) / safe)
+    return np.asarray(factor[:, None] * v)
