@@ -48,6 +48,7 @@ class Refinement:
         chi2: Sum of squared whitened residuals.
         by_b: Derivative of the two tangents by the tangents of b_i, (12, n, 6).
         gradient: Derivative of the residuals by the two tangents, (n, 6, 12).
+        residuals_by_b: Derivative of the residuals by the tangents of b_i, (n, 6, 6).
         precision: Inverse covariances of the residuals, shape (n, 6, 6).
     """
 
@@ -58,6 +59,7 @@ class Refinement:
     chi2: float
     by_b: Floats
     gradient: Floats
+    residuals_by_b: Floats
     precision: Floats
 
 
@@ -144,6 +146,7 @@ def refine_axzb(
         float(np.einsum("ni,nij,nj->", e, precision, e)),
         -np.einsum("pi,nij->pnj", covariance, weighted @ by_b),
         gradient,
+        by_b,
         precision,
     )
 
