@@ -1,0 +1,11 @@
+"""Stage 4: cameras from the three markers.
+
+One camera from half-turns of the triangle (Zhao, Liu and Zhang 2008,
+doi:10.1109/TIP.2008.2005562, Sec. III): special_motion (III-A, B, C), homography and
+closed_form (the same constraints, whitened), extrinsics (III-D), refine (III-E),
+degeneracy (III-F).
+"""
+
+from handeye_tri.calibrate_cameras.single_camera import calibrate_camera
+
+__all__ = ["calibrate_camera"]

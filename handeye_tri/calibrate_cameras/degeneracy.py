@@ -1,0 +1,185 @@
+"""What leaves the camera undetermined, said before or after solving (Sec. III-F).
+
+Zhao, Liu and Zhang 2008 (doi:10.1109/TIP.2008.2005562), Proposition 1: half-turns
+whose supporting planes are parallel give the same two constraints. Singular values
+say so on exact data only; on noisy data the spread of the planes against its own
+uncertainty and the predicted sigma of the focal length are the better judges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.calibrate_cameras.closed_form import NOMINAL_FOCAL
+from handeye_tri.calibrate_cameras.homography import Homographies, vanishing_lines
+from handeye_tri.calibrate_cameras.special_motion import foot_fraction
+from handeye_tri.errors import DegenerateMotionError
+from handeye_tri.triangle import EDGES, VERTICES, Axis, TriangleRig
+
+Floats = NDArray[np.float64]
+
+# Angle at an end of an edge axis nearer to 90 degrees than this: no homography.
+_MIN_OFF_RIGHT_ANGLE = np.radians(1.0)
+# Planes closer to parallel than this are one plane for any practical noise.
+_MIN_PLANE_SPREAD_DEG = 0.5
+# A focal length whose sigma is a larger part of it than this is not determined.
+_MAX_RELATIVE_SIGMA = 0.5
+# Scaled information worse conditioned than this is singular in double precision.
+_MAX_CONDITION = 1e14
+# Noise that is assumed at least where the residuals are at rounding, pixels.
+_LEAST_NOISE_PX = 1e-3
+
+
+def check_count(n: int, skew: bool, unknowns: int, per_half_turn: int) -> None:
+    """Refuse fewer half-turns than unknowns need (Sec. III-C).
+
+    Args:
+        n: Complete half-turns.
+        skew: Whether skew is estimated.
+        unknowns: Shared unknowns: intrinsics, lens coefficients, a shared O.
+        per_half_turn: Observations of a half-turn less its own unknowns.
+
+    Raises:
+        DegenerateMotionError: says how many there are and how many are needed.
+    """
+    needed = max(3 if skew else 2, unknowns // per_half_turn + 1)
+    if n < needed:
+        remedy = "add half-turns about other planes"
+        if skew and n == 2 and unknowns - 1 < n * per_half_turn:
+            remedy += ", or fix the skew at zero (skew=False), for which 2 are enough"
+        raise DegenerateMotionError(
+            f"{n} half-turns are too few for {unknowns} unknowns of camera and axis"
+            f"{' with skew' if skew else ''}: at least {needed} are needed, because "
+            f"each gives 2 constraints on K; {remedy}"
+        )
+
+
+def check_axis_ends(triangle: TriangleRig, axes: Sequence[Axis]) -> None:
+    """Refuse an edge axis with a right angle at one of its ends.
+
+    There B, B' and that end are in line: no homography, one constraint, not two.
+
+    Raises:
+        DegenerateMotionError: names the edge, the angle and the edge to use.
+    """
+    for axis in dict.fromkeys(axes):
+        if axis == "normal":
+            continue
+        for vertex in EDGES[axis]:
+            angle = triangle.angles[vertex]
+            if abs(angle - 0.5 * np.pi) < _MIN_OFF_RIGHT_ANGLE:
+                lengths = {
+                    "AB": triangle.side_ab,
+                    "BC": triangle.side_bc,
+                    "CA": triangle.side_ac,
+                }
+                longest = max(lengths, key=lambda name: lengths[name])
+                raise DegenerateMotionError(
+                    f"the angle at {VERTICES[vertex]}, an end of the axis {axis}, is "
+                    f"{np.degrees(angle):.2f} degrees (k = "
+                    f"{foot_fraction(triangle, axis):.4f}): the turned marker, its "
+                    "image and that end are in line, and each half-turn gives one "
+                    f"constraint instead of two; turn about the longest edge {longest}"
+                )
+
+
+def plane_spread_deg(normals: Floats) -> float:
+    """Largest angle between two planes, degrees, of unit normals (n, 3)."""
+    cosine = np.abs(normals @ normals.T).min()
+    return float(np.degrees(np.arccos(min(cosine, 1.0))))
+
+
+def nominal_normals(homographies: Homographies) -> Floats:
+    """Unit plane normals as a nominal camera sees them, shape (n, 3)."""
+    line, _ = vanishing_lines(homographies)
+    normals = np.concatenate([NOMINAL_FOCAL * line, np.ones((len(line), 1))], axis=1)
+    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
+def check_planes(homographies: Homographies, noise_known: bool) -> None:
+    """Refuse planes that cannot be told from parallel ones (Proposition 1).
+
+    The vanishing lines of parallel planes are equal, whatever K is. If their scatter
+    is within what the pixel noise explains (chi-square, three of its own standard
+    deviations above its mean), or the planes are within half a degree, K is
+    undetermined.
+
+    Args:
+        homographies: One per half-turn.
+        noise_known: Whether the covariances are absolute; otherwise they are scaled
+            by the homographies' own chi2 / dof.
+
+    Raises:
+        DegenerateMotionError: says the spread and the tilt, in degrees.
+    """
+    normals = nominal_normals(homographies)
+    spread = plane_spread_deg(normals)
+    line, covariance = vanishing_lines(homographies)
+    if not noise_known:
+        covariance = covariance * (homographies.chi2 / homographies.dof)
+    covariance = covariance + np.eye(2) * 1e-18
+    weight = np.linalg.inv(covariance)
+    mean = np.linalg.solve(
+        weight.sum(axis=0), (weight @ line[..., None])[..., 0].sum(axis=0)
+    )
+    chi2 = float(np.einsum("ni,nij,nj->", line - mean, weight, line - mean))
+    freedom = 2 * (len(line) - 1)
+    explained = chi2 <= freedom + 3.0 * np.sqrt(2.0 * freedom)
+    if not explained and spread >= _MIN_PLANE_SPREAD_DEG:
+        return
+    tilt = float(np.degrees(np.arccos(normals[:, 2].clip(-1.0, 1.0))).max())
+    facing = " (all of them face the camera: fronto-parallel)" if tilt < 10 else ""
+    scatter = (
+        f"its scatter is no more than noise, chi2 {chi2:.1f} for {freedom}"
+        if explained
+        else "the same plane to within half a degree"
+    )
+    raise DegenerateMotionError(
+        f"the triangle's planes are parallel in all {len(line)} half-turns: spread "
+        f"{spread:.2f} degrees, {scatter}; tilt at most {tilt:.1f} degrees{facing}. "
+        "By Proposition 1 they give one pair of constraints; tilt the triangle by at "
+        "least 20 degrees between half-turns"
+    )
+
+
+def scaled_condition(information: Floats) -> float:
+    """Condition number of an information matrix scaled to a unit diagonal."""
+    diagonal = np.sqrt(np.diagonal(information))
+    if not (diagonal > 0).all() or not np.isfinite(information).all():
+        return float("inf")
+    values = np.linalg.eigvalsh(information / np.outer(diagonal, diagonal))
+    return float("inf") if values[0] <= 0 else float(values[-1] / values[0])
+
+
+def check_determined(
+    condition: float, focal: Floats, sigma: Floats, spread_deg: float
+) -> None:
+    """Refuse a focal length that the data do not determine.
+
+    Args:
+        condition: Of the scaled information on the shared unknowns.
+        focal: fx and fy, shape (2,), pixels.
+        sigma: Their predicted standard deviations, shape (2,), pixels.
+        spread_deg: Largest angle between two planes, degrees.
+
+    Raises:
+        DegenerateMotionError: says sigma, spread and condition.
+    """
+    relative = float((sigma / focal).max()) if np.isfinite(sigma).all() else np.inf
+    if condition <= _MAX_CONDITION and relative <= _MAX_RELATIVE_SIGMA:
+        return
+    raise DegenerateMotionError(
+        f"the half-turns do not determine the focal length: fx {focal[0]:.1f} px with "
+        f"a predicted sigma of {sigma[0]:.3g} px, fy {focal[1]:.1f} with "
+        f"{sigma[1]:.3g} (condition {condition:.2g}, planes spread by "
+        f"{spread_deg:.1f} degrees); use at least three different planes, 20 degrees "
+        "or more apart, and a triangle that is larger in the image"
+    )
+
+
+def least_noise(chi2_per_dof: float, noise_known: bool) -> float:
+    """Factor on covariances that keeps rounding-level residuals from hiding a gap."""
+    return 1.0 if noise_known else max(chi2_per_dof, _LEAST_NOISE_PX**2)

@@ -1,0 +1,239 @@
+"""Levenberg-Marquardt for residuals in blocks with own and shared unknowns.
+
+Every residual belongs to one block (here a half-turn), which has l unknowns of its
+own; g unknowns are shared by all. The own unknowns are eliminated block by block
+(Schur complement; Triggs et al. 1999, doi:10.1007/3-540-44480-7_21), so that cost
+grows in proportion to the blocks. Unknowns that no residual depends on stay put.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+_START_DAMPING = 1e-4
+_MAX_DAMPING = 1e12
+# (step / sigma)^2 of the last step taken; the one after would be its square.
+_RELATIVE_TOLERANCE = 1e-9
+
+
+class Linearised(Protocol):
+    """Residuals at one state, with what a step needs to know of them."""
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared residuals."""
+
+    @property
+    def observations(self) -> int:
+        """Number of residuals."""
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns, own and shared."""
+
+    def equations(self) -> NormalEquations:
+        """The normal equations at this state."""
+
+
+State = TypeVar("State")
+Rows = TypeVar("Rows", bound=Linearised)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blocks:
+    """Residuals and derivatives at one state.
+
+    Attributes:
+        residuals: Whitened, shape (n, r).
+        own: Derivatives by each block's own unknowns, shape (n, r, l).
+        shared: Derivatives by the shared unknowns, shape (n, r, g).
+    """
+
+    residuals: Floats
+    own: Floats
+    shared: Floats
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared residuals."""
+        return float(np.vdot(self.residuals, self.residuals))
+
+    @property
+    def observations(self) -> int:
+        """Number of residuals."""
+        return self.residuals.size
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns, own and shared."""
+        return len(self.own) * self.own.shape[-1] + self.shared.shape[-1]
+
+    def equations(self) -> NormalEquations:
+        """The normal equations at this state."""
+        return NormalEquations.of(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """J'J and J'r of :class:`Blocks`, by parts.
+
+    Attributes:
+        own: Shape (n, l, l).
+        cross: Shape (n, l, g).
+        shared: Shape (g, g).
+        own_gradient: Shape (n, l).
+        shared_gradient: Shape (g,).
+    """
+
+    own: Floats
+    cross: Floats
+    shared: Floats
+    own_gradient: Floats
+    shared_gradient: Floats
+
+    @classmethod
+    def of(cls, blocks: Blocks) -> NormalEquations:
+        """Multiply out."""
+        size: int = blocks.own.shape[-1]
+        joined = np.concatenate(
+            [blocks.own, blocks.shared, blocks.residuals[..., None]], axis=-1
+        )
+        product = np.swapaxes(joined, -1, -2) @ joined
+        total = product[:, size:, size:].sum(axis=0)
+        own = product[:, :size, :size]
+        diagonal = np.einsum("nii->ni", own)
+        diagonal[diagonal == 0.0] = 1.0
+        return cls(
+            own,
+            product[:, :size, size:-1],
+            total[:-1, :-1],
+            product[:, :size, -1],
+            total[:-1, -1],
+        )
+
+    def step(self, damping: float) -> tuple[Floats, Floats, float]:
+        """Damped step of own (n, l) and shared (g,) unknowns; its predicted gain.
+
+        Raises:
+            numpy.linalg.LinAlgError: the damped equations are singular.
+        """
+        g = len(self.shared_gradient)
+        own, shared = self.own.copy(), self.shared.copy()
+        own_diagonal = np.einsum("nii->ni", own)
+        shared_diagonal = np.einsum("ii->i", shared)
+        own_scale, shared_scale = own_diagonal.copy(), shared_diagonal.copy()
+        own_diagonal *= 1.0 + damping
+        shared_diagonal *= 1.0 + damping
+        right = np.concatenate([self.cross, self.own_gradient[..., None]], axis=-1)
+        solved = np.linalg.solve(own, right)
+        reduced = np.tensordot(self.cross, solved, axes=((0, 1), (0, 1)))
+        d_shared = -np.linalg.solve(
+            shared - reduced[:, :g], self.shared_gradient - reduced[:, g]
+        )
+        d_own = -solved[..., g] - solved[..., :g] @ d_shared
+        gain = (
+            damping * float(np.vdot(own_scale, d_own**2))
+            + damping * float(shared_scale @ d_shared**2)
+            - float(np.vdot(d_own, self.own_gradient))
+            - float(d_shared @ self.shared_gradient)
+        )
+        return d_own, d_shared, gain
+
+    def reduced(self) -> Floats:
+        """Information on the shared unknowns alone, shape (g, g)."""
+        solved = np.linalg.solve(self.own, self.cross)
+        eliminated = np.tensordot(self.cross, solved, axes=((0, 1), (0, 1)))
+        return np.asarray(self.shared - eliminated)
+
+    def own_covariance(self) -> Floats:
+        """Covariance of each block's own unknowns, shape (n, l, l)."""
+        inverse = np.linalg.inv(self.own)
+        if len(self.shared_gradient) == 0:
+            return np.asarray(inverse)
+        solved = inverse @ self.cross
+        covariance = np.linalg.inv(self.reduced())
+        return np.asarray(inverse + solved @ covariance @ np.swapaxes(solved, -1, -2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Minimum(Generic[State, Rows]):
+    """Where the iteration ended.
+
+    Attributes:
+        state: The unknowns.
+        blocks: Residuals and derivatives there.
+        cost: Sum of squared residuals.
+        cost_start: The same at the start.
+        iterations: Evaluations after the first.
+        converged: Whether the last step was negligible against its own sigma.
+    """
+
+    state: State
+    blocks: Rows
+    cost: float
+    cost_start: float
+    iterations: int
+    converged: bool
+
+
+def minimise(
+    evaluate: Callable[[State], Rows | None],
+    retract: Callable[[State, Floats, Floats], State],
+    start: State,
+    rounding: float,
+    max_iterations: int = 100,
+) -> Minimum[State, Rows] | None:
+    """Levenberg-Marquardt with Nielsen's damping rule (IMM-REP-1999-05).
+
+    Args:
+        evaluate: Residuals and derivatives at a state; None where it is no camera.
+        retract: Moves a state by steps (n, l) and (g,).
+        start: Where to begin.
+        rounding: Root mean square of whitened residuals that is rounding only.
+        max_iterations: Upper limit of evaluations.
+
+    Returns:
+        The minimum; None where the start cannot be evaluated.
+    """
+    blocks = evaluate(start)
+    if blocks is None:
+        return None
+    state, cost = start, blocks.cost
+    cost_start = cost
+    freedom = max(blocks.observations - blocks.unknowns, 1)
+    floor = blocks.observations * rounding**2
+    damping, growth = _START_DAMPING, 2.0
+    equations = blocks.equations()
+    converged = False
+    iteration = 0
+    while iteration < max_iterations and damping < _MAX_DAMPING:
+        iteration += 1
+        try:
+            d_own, d_shared, gain = equations.step(damping)
+        except np.linalg.LinAlgError:
+            damping, growth = damping * growth, 2 * growth
+            continue
+        negligible = gain <= max(_RELATIVE_TOLERANCE * cost / freedom, floor)
+        candidate = retract(state, d_own, d_shared)
+        tried = evaluate(candidate)
+        tried_cost = np.inf if tried is None else tried.cost
+        if tried is not None and tried_cost <= cost:
+            ratio = (cost - tried_cost) / gain if gain > 0 else 1.0
+            state, blocks, cost = candidate, tried, tried_cost
+            damping *= max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
+            growth = 2.0
+            equations = blocks.equations()
+        else:
+            damping, growth = damping * growth, 2 * growth
+        # A strongly damped step is short for that reason alone.
+        if negligible and damping < 1.0:
+            converged = True
+            break
+    return Minimum(state, blocks, cost, cost_start, iteration, converged)

@@ -1,0 +1,363 @@
+"""One camera from half-turns of the triangle: the public function and its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handeye_tri.calibrate_cameras.closed_form import (
+    ClosedForm,
+    ClosedFormMethod,
+    closed_form,
+)
+from handeye_tri.calibrate_cameras.degeneracy import (
+    check_axis_ends,
+    check_count,
+    check_determined,
+    check_planes,
+    least_noise,
+    plane_spread_deg,
+    scaled_condition,
+)
+from handeye_tri.calibrate_cameras.extrinsics import poses_from_homographies
+from handeye_tri.calibrate_cameras.half_turns import HalfTurnData, read_half_turns
+from handeye_tri.calibrate_cameras.homography import (
+    Homographies,
+    fit_homographies,
+)
+from handeye_tri.calibrate_cameras.least_squares import NormalEquations
+from handeye_tri.calibrate_cameras.options import (
+    lens_choice,
+    o_choice,
+    turn_covariances,
+)
+from handeye_tri.calibrate_cameras.refine import (
+    HalfTurnModel,
+    State,
+    refine_from_starts,
+)
+from handeye_tri.calibrate_cameras.special_motion import diagonals_meet
+from handeye_tri.camera import (
+    INTRINSIC_NAMES,
+    LENS_COEFFICIENTS,
+    Intrinsics,
+    Lens,
+    LensModel,
+    PinholeCamera,
+)
+from handeye_tri.errors import (
+    ConvergenceError,
+    DegenerateMotionError,
+    InputError,
+)
+from handeye_tri.records import CameraCalibration, Covariance
+from handeye_tri.se3 import SE3
+from handeye_tri.triangle import EDGES, Axis, TriangleRig
+
+Floats = NDArray[np.float64]
+
+# Focal length of the generic second start over the longer side of the image: too
+# long rather than too short, from where the descent is smoother.
+_GENERIC_FOCAL = 2.5
+
+
+def calibrate_camera(
+    before: ArrayLike,
+    after: ArrayLike,
+    triangle: TriangleRig,
+    *,
+    image_size: tuple[int, int],
+    axis: Axis | Sequence[Axis] = "normal",
+    skew: bool = True,
+    distortion: LensModel | Sequence[str] | None = None,
+    refine: bool = True,
+    method: ClosedFormMethod = "whitened",
+    sigma_px: float | None = None,
+    covariance: ArrayLike | None = None,
+    o: Literal["shared", "free"] | ArrayLike = "shared",
+    turn_covariance: ArrayLike | None = None,
+    name: str = "camera",
+) -> CameraCalibration:
+    """Calibrate one camera from n half-turns of three markers.
+
+    Closed form (Zhao, Liu and Zhang 2008, doi:10.1109/TIP.2008.2005562, Sec. III-A
+    to III-D), then maximum likelihood with one pose per half-turn (Sec. III-E).
+
+    Args:
+        before: Pixels of A, B, C before each half-turn, shape (n, 3, 2). Half-turns
+            with a NaN, before or after, are left out.
+        after: After it, shape (n, 3, 2).
+        triangle: The rig; only its side ratios matter for K.
+        image_size: (width, height), pixels.
+        axis: "normal" (Sec. III-A) or an edge "AB", "BC", "CA" (Sec. III-B); one for
+            all half-turns or one each.
+        skew: Whether the skew factor is estimated; otherwise it is zero.
+        distortion: Lens coefficients to estimate: all of a model, or their names.
+        refine: False stops at the closed form.
+        method: Closed form by the paper's rows, or by whitened homographies, which
+            are about twice as accurate. With ``refine`` it is only the start.
+        sigma_px: Standard deviation of each pixel coordinate.
+        covariance: Instead: covariance of each observed point, (n, 2, 3, 2, 2), px^2.
+            With neither, points count alike and the covariance of the result is
+            scaled by chi2 / dof.
+        o: Where a normal axis meets the triangle's plane: unknown and the same in all
+            half-turns, free in each, or known, shape (2,), metres.
+        turn_covariance: Of the tangent xi (translation m, rotation rad) by which a
+            half-turn misses, ``after = before @ half_turn @ exp(xi)`` in the
+            triangle's frame, shape (6, 6) or (n, 6, 6). None: half-turns are exact.
+        name: The camera's name in the covariance labels.
+
+    Returns:
+        The camera. ``residuals`` has shape (1, 2n, 3, 2): half-turns 0 ... n-1 before,
+        then 0 ... n-1 after. ``covariance`` has the estimated quantities only.
+        ``cost_start`` is chi2 at the closed form, or, where that failed, at the
+        generic start. ``details`` has:
+
+        - "camera_from_triangle": before each half-turn, (n, 4, 4), metres;
+          "camera_from_triangle_after": after it (NaN where left out);
+        - "o": foot of the axis in the triangle's frame, (n, 2), metres, NaN for edges;
+        - "self_check_px": (n,), computed without K. For a normal axis the RMS distance
+          of AA', BB', CC' from their common point, for an edge the RMS of how far the
+          two markers on it moved;
+        - "turn_sigmas": (n, 6), the deviation of each half-turn over its prior's root,
+          where there is a turn_covariance;
+        - "used": indices of the half-turns used; "plane_spread_deg"; "start";
+          "iterations".
+
+    Raises:
+        InputError: an argument cannot be used.
+        DegenerateMotionError: the half-turns do not determine the camera.
+        ConvergenceError: the refinement did not settle.
+    """
+    lens_model, lens = lens_choice(distortion)
+    if method not in ("whitened", "paper"):
+        raise InputError(f'method must be "whitened" or "paper", got {method!r}')
+    if not refine and (lens or turn_covariance is not None):
+        raise InputError(
+            "distortion and turn_covariance need refine=True: the closed form knows "
+            "neither a lens nor inexact half-turns"
+        )
+    o_mode, known_o = o_choice(o)
+    data, used = read_half_turns(
+        before, after, triangle, image_size, axis, sigma_px, covariance
+    )
+    n = len(np.asarray(before))
+    noise_known = sigma_px is not None or covariance is not None
+    turn = turn_covariances(turn_covariance, n, used, noise_known)
+    model = HalfTurnModel(
+        data, skew=skew, lens=lens, o_mode=o_mode, turn_covariance=turn
+    )
+    check_count(
+        len(data),
+        skew,
+        model.camera_unknowns + 2 * model.shared_o,
+        4 if model.free_o else 6,
+    )
+    check_axis_ends(triangle, data.axes)
+    homographies = fit_homographies(data, o_mode, known_o)
+    check_planes(homographies, noise_known)
+
+    first: ClosedForm | None = None
+    try:
+        first = closed_form(data, homographies, skew, method)
+    except DegenerateMotionError:
+        if not refine or method == "paper":
+            raise
+    zero = State(
+        np.zeros(5),
+        np.zeros(len(LENS_COEFFICIENTS[lens_model])),
+        np.zeros((len(data), 4, 4)),
+        homographies.o,
+        np.zeros((len(data), 0 if turn is None else 6)),
+    )
+    if first is not None and not refine:
+        outcome = _stop_at_closed_form(model, zero, first, homographies, noise_known)
+    else:
+        outcome = _refined(model, zero, first, homographies, noise_known)
+    camera = PinholeCamera(
+        name,
+        Intrinsics.from_vector(outcome.state.intrinsics),
+        data.image_size,
+        Lens(lens_model, outcome.state.lens),
+    )
+    names = [INTRINSIC_NAMES[i] for i in model.intrinsics]
+    names += [LENS_COEFFICIENTS[lens_model][i] for i in lens]
+    residuals = np.full((1, 2 * n, 3, 2), np.nan)
+    missed = data.pixels - model.predict(outcome.state)
+    residuals[0, used], residuals[0, n + used] = missed[:, 0], missed[:, 1]
+    residuals.setflags(write=False)
+    return CameraCalibration(
+        cameras=(camera,),
+        reference_from_camera=(SE3.identity(),),
+        covariance=Covariance(
+            tuple(f"{name}.{quantity}" for quantity in names), outcome.covariance
+        ),
+        chi2=outcome.chi2,
+        dof=model.dof,
+        residuals=residuals,
+        condition=outcome.condition,
+        cost_start=outcome.cost_start,
+        method=f"{method}, {'refined' if refine else 'closed form'}",
+        details=_details(model, outcome, n, used),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Outcome:
+    state: State
+    covariance: Floats
+    chi2: float
+    condition: float
+    cost_start: float
+    start: str
+    iterations: int
+
+
+def _stop_at_closed_form(
+    model: HalfTurnModel,
+    zero: State,
+    first: ClosedForm,
+    homographies: Homographies,
+    noise_known: bool,
+) -> _Outcome:
+    state = _pinhole_state(model, zero, first.k, first.poses)
+    blocks = model.evaluate(state)
+    if blocks is None:
+        raise DegenerateMotionError(
+            "the closed form puts a marker behind the camera "
+            f"(fx {first.k[0, 0]:.1f} px, fy {first.k[1, 1]:.1f} px): the views are "
+            "too weak for it; use refine=True, or planes 20 degrees or more apart"
+        )
+    noise = homographies.chi2 / homographies.dof
+    rows = np.ix_(model.intrinsics, model.intrinsics)
+    covariance = first.covariance[rows]
+    condition = scaled_condition(NormalEquations.of(blocks).reduced())
+    sigma = np.sqrt(np.diagonal(covariance)[:2] * least_noise(noise, noise_known))
+    check_determined(
+        condition, state.intrinsics[:2], sigma, plane_spread_deg(state.poses[:, :3, 2])
+    )
+    return _Outcome(
+        state,
+        covariance * (1.0 if noise_known else noise),
+        blocks.cost,
+        condition,
+        blocks.cost,
+        "closed form",
+        0,
+    )
+
+
+def _refined(
+    model: HalfTurnModel,
+    zero: State,
+    first: ClosedForm | None,
+    homographies: Homographies,
+    noise_known: bool,
+) -> _Outcome:
+    generic = _generic_camera(model.data.image_size)
+    poses = poses_from_homographies(generic, homographies, model.data.triangle)
+    starts = {"generic": _pinhole_state(model, zero, generic, poses)}
+    if first is not None:
+        closed = _pinhole_state(model, zero, first.k, first.poses)
+        starts = {"closed form": closed, **starts}
+    found = refine_from_starts(model, list(starts.values()))
+    if found is None:
+        raise DegenerateMotionError(
+            "no start has all markers in front of the camera: before and after do not "
+            "show half-turns of this triangle; check axis, triangle and marker order"
+        )
+    end, chosen = found
+    state = end.state
+    equations = NormalEquations.of(end.blocks)
+    information = equations.reduced()
+    condition = scaled_condition(information)
+    noise = end.cost / model.dof
+    count = model.camera_unknowns
+    spread = plane_spread_deg(state.poses[:, :3, 2])
+    covariance = np.full((count, count), np.inf)
+    if np.isfinite(condition):
+        covariance = np.linalg.inv(information)[:count, :count]
+    sigma = np.sqrt(np.diagonal(covariance)[:2] * least_noise(noise, noise_known))
+    check_determined(condition, state.intrinsics[:2], sigma, spread)
+    if not end.converged:
+        raise ConvergenceError(
+            f"the refinement did not settle in {end.iterations} iterations (chi2 "
+            f"{end.cost_start:.4g} to {end.cost:.4g} for {model.dof} degrees of "
+            "freedom); estimate fewer lens coefficients or add half-turns"
+        )
+    covariance = covariance * (1.0 if noise_known else noise)
+    closed_cost = None if first is None else model.evaluate(closed)
+    return _Outcome(
+        state,
+        0.5 * (covariance + covariance.T),
+        end.cost,
+        condition,
+        end.cost_start if closed_cost is None else closed_cost.cost,
+        list(starts)[chosen],
+        end.iterations,
+    )
+
+
+def _generic_camera(image_size: tuple[int, int]) -> Floats:
+    width, height = image_size
+    focal = _GENERIC_FOCAL * max(width, height)
+    return np.array(
+        [
+            [focal, 0.0, 0.5 * (width - 1)],
+            [0.0, focal, 0.5 * (height - 1)],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def _pinhole_state(
+    model: HalfTurnModel, zero: State, k: Floats, poses: Floats
+) -> State:
+    skew = k[0, 1] if 2 in model.intrinsics else 0.0
+    intrinsics = np.array([k[0, 0], k[1, 1], skew, k[0, 2], k[1, 2]])
+    return replace(zero, intrinsics=intrinsics, poses=poses)
+
+
+def _details(
+    model: HalfTurnModel, outcome: _Outcome, n: int, used: NDArray[np.intp]
+) -> dict[str, Any]:
+    def whole(values: Floats) -> Floats:
+        """Rows of all n half-turns, NaN for those left out; locked."""
+        result = np.full((n, *values.shape[1:]), np.nan)
+        result[used] = values
+        result.setflags(write=False)
+        return result
+
+    data, state = model.data, outcome.state
+    o = np.where(data.about_normal[:, None] > 0, state.o, np.nan)
+    result: dict[str, Any] = {
+        "camera_from_triangle": whole(state.poses),
+        "camera_from_triangle_after": whole(model.after_poses(state)),
+        "o": whole(o),
+        "self_check_px": whole(self_check(data)),
+        "used": used,
+        "plane_spread_deg": plane_spread_deg(state.poses[:, :3, 2]),
+        "start": outcome.start,
+        "iterations": outcome.iterations,
+    }
+    if model.turn_root is not None:
+        result["turn_sigmas"] = whole(state.turn)
+    return result
+
+
+def self_check(data: HalfTurnData) -> Floats:
+    """How far each half-turn is from one, judged without K, shape (n,), pixels.
+
+    For a normal axis the RMS distance of the lines AA', BB', CC' from their common
+    point; for an edge the RMS distance that its two markers moved.
+    """
+    moved = np.linalg.norm(data.pixels[:, 1] - data.pixels[:, 0], axis=-1)
+    _, result = diagonals_meet(data.pixels[:, 0], data.pixels[:, 1])
+    for i, axis in enumerate(data.axes):
+        if axis != "normal":
+            result[i] = np.sqrt(np.mean(moved[i, list(EDGES[axis])] ** 2))
+    return result
