@@ -8,20 +8,31 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from handeye_tri.errors import InputError, MissingDependencyError
-from handeye_tri.mechanism import Body, Geometry, Joint, JointKind, Mechanism, Shape
+from handeye_tri.imaging import Image, Optics, Pinhole, develop
+from handeye_tri.mechanism import Mechanism
+from handeye_tri.model_arrays import (
+    ARM_PREFIX,
+    RIG,
+    STAND,
+    ArmFrames,
+    find_frames,
+    mechanism_of,
+)
+from handeye_tri.records import GroundTruth, Plan, Repeatability
 from handeye_tri.rig import rig_rods
-from handeye_tri.se3 import SE3, quaternion_wxyz, rotation_from_quaternion_wxyz
+from handeye_tri.se3 import quaternion_wxyz
 
 if TYPE_CHECKING:
+    from handeye_tri.arm import Arm
     from handeye_tri.config import Cell
 
 if sys.platform == "linux":
@@ -32,15 +43,16 @@ Floats = NDArray[np.float64]
 
 _MISSING_GL = (
     "MuJoCo finds no OpenGL to render with ({}); on Debian and Ubuntu install it by "
-    "`apt-get install libegl1 libgl1 libgl1-mesa-dri`"
+    "`apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri`"
 )
-_STAND = "cell/stand"
-# What the cell adds can not clash with a name in the arm's model.
-_ARM = "arm/"
-_RIG = "rig"
+# Names of random streams, so that none is used twice.
+_ROBOT_STREAM, _SENSOR_STREAM = 101, 102
 # Solid and drawn.
 _SOLID = {"contype": 1, "conaffinity": 1, "group": 0}
+_CELL = "cell"
 _GREYS = {"rod": 0.30, "surroundings": 0.38, "housing": 0.16}
+# Optical frames look along z with y down, MuJoCo's along -z with y up.
+_OPTICAL_FROM_MUJOCO = np.diag([1.0, -1.0, -1.0])
 
 
 def _mujoco() -> Any:
@@ -71,45 +83,28 @@ def compile_mechanism(cell: Cell, model_path: Path) -> Mechanism:
             it (lists those that are), or it has joints that are not supported.
         MissingDependencyError: MuJoCo's OpenGL library is missing.
     """
-    return _compile(cell, model_path).mechanism
+    return _compile(cell, model_path)[1]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Compiled:
-    model: Any
-    mechanism: Mechanism
-
-
-@dataclass(frozen=True, slots=True)
-class _Frames:
-    """Frames found in the arm's own model; base "" is that model's world."""
-
-    base: str
-    base_position: Floats
-    flange_body: str
-    body_from_flange: SE3
-    speeds: dict[str, float]
-
-
-def _compile(cell: Cell, model_path: Path) -> _Compiled:
+def _compile(cell: Cell, model_path: Path) -> tuple[Any, Mechanism]:
     mujoco = _mujoco()
     arm = _load(mujoco, model_path)
-    frames = _find_frames(cell, model_path, _compile_spec(arm, model_path))
+    frames = find_frames(cell, model_path, _compile_spec(arm, model_path))
     spec = mujoco.MjSpec()
     _set_scene(mujoco, spec)
     # The arm's own world becomes this body, so that it moves as one.
     stand = spec.worldbody.add_body(
-        name=_STAND, pos=np.array(cell.arm.position_m) - frames.base_position
+        name=STAND, pos=np.array(cell.arm.position_m) - frames.base_position
     )
     try:
-        spec.attach(arm, prefix=_ARM, frame=stand.add_frame())
+        spec.attach(arm, prefix=ARM_PREFIX, frame=stand.add_frame())
     except ValueError as error:
         raise InputError(f"{model_path}: {_one_line(error)}") from None
     _add_surroundings(mujoco, spec, cell)
     _add_cameras(mujoco, spec, cell)
     _add_rig(mujoco, spec, cell, frames)
     model = _compile_spec(spec, model_path)
-    return _Compiled(model, _mechanism(cell, model_path, model, frames))
+    return model, mechanism_of(cell, model_path, model, frames)
 
 
 def _one_line(error: Exception) -> str:
@@ -140,103 +135,6 @@ def _compile_spec(spec: Any, path: Path) -> Any:
         ) from None
 
 
-def _pose(position: Any, quaternion: Any) -> SE3:
-    return SE3.from_parts(rotation_from_quaternion_wxyz(quaternion), position)
-
-
-def _find_frames(cell: Cell, path: Path, model: Any) -> _Frames:
-    bodies = [model.body(k).name for k in range(model.nbody)]
-    sites = [model.site(k).name for k in range(model.nsite)]
-    for k in range(model.njnt):
-        if int(model.jnt_type[k]) in (0, 1):
-            kind = ("free", "ball")[int(model.jnt_type[k])]
-            raise InputError(
-                f"{path}: joint {model.joint(k).name or k!r} is a {kind} joint; only "
-                "hinge and slide joints are supported, remove it from the model"
-            )
-    flange = cell.arm.flange
-    if flange in sites:
-        site = model.site(flange)
-        flange_body = int(site.bodyid[0])
-        body_from_flange = _pose(site.pos, site.quat)
-    elif flange in bodies[1:]:
-        flange_body = bodies.index(flange)
-        body_from_flange = SE3.identity()
-    else:
-        raise InputError(
-            f"{path}: arm.flange: no body or site {flange!r}; the model has "
-            f"bodies {_listed(bodies[1:])} and sites {_listed(sites)}"
-        )
-    if not bodies[flange_body]:
-        raise InputError(
-            f"{path}: arm.flange: the body that carries {flange!r} has no name; "
-            "give it one in the model"
-        )
-    chain = [flange_body]
-    while chain[-1] != 0:
-        chain.append(int(model.body_parentid[chain[-1]]))
-    chain.reverse()
-    base = cell.arm.base
-    if base is None:
-        # The first link, if it is fixed; a first link that moves stands on the world.
-        first = chain[1] if len(chain) > 1 else 0
-        base_body = 0 if model.body_jntnum[first] else first
-    elif base in bodies:
-        base_body = bodies.index(base)
-    else:
-        raise InputError(
-            f"{path}: arm.base: no body {base!r}; the model has {_listed(bodies)}"
-        )
-    if base_body not in chain:
-        raise InputError(
-            f"{path}: arm.base: {base!r} does not carry the flange {flange!r}; "
-            f"bodies from the world to the flange are "
-            f"{_listed([bodies[k] for k in chain])}"
-        )
-    below = chain[: chain.index(base_body) + 1]
-    moving = [bodies[k] for k in below if model.body_jntnum[k]]
-    if moving:
-        raise InputError(
-            f"{path}: arm.base: {base!r} moves, since {_listed(moving)} has a joint; "
-            "name a body that stands still"
-        )
-    if not bodies[base_body]:
-        raise InputError(
-            f"{path}: arm.base: the arm's first body has no name; give it one in "
-            "the model"
-        )
-    pose = SE3.identity()
-    for k in below[1:]:
-        pose = pose @ _pose(model.body_pos[k], model.body_quat[k])
-    return _Frames(
-        bodies[base_body] if base_body else "",
-        pose.translation,
-        bodies[flange_body],
-        body_from_flange,
-        _speeds(path, model),
-    )
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(name for name in names if name) or "none with a name"
-
-
-def _speeds(path: Path, model: Any) -> dict[str, float]:
-    """Joint speeds: MJCF ``<numeric name="speed:JOINT">``, URDF ``velocity``."""
-    speeds = {
-        model.numeric(k).name.removeprefix("speed:"): float(model.numeric(k).data[0])
-        for k in range(model.nnumeric)
-        if model.numeric(k).name.startswith("speed:")
-    }
-    root = ElementTree.parse(path).getroot()
-    if root.tag == "robot":
-        for joint in root.iter("joint"):
-            limit = joint.find("limit")
-            if limit is not None and "velocity" in limit.attrib:
-                speeds[joint.get("name", "")] = float(limit.attrib["velocity"])
-    return speeds
-
-
 def _set_scene(mujoco: Any, spec: Any) -> None:
     """Neutral grey light, the same for every arm; clip planes in metres."""
     spec.modelname = "handeye_tri cell"
@@ -253,7 +151,7 @@ def _set_scene(mujoco: Any, spec: Any) -> None:
     spec.visual.headlight.diffuse = [0.30, 0.30, 0.30]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
     spec.worldbody.add_light(
-        name="cell/light",
+        name=f"{_CELL}/light",
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         pos=[1.0, 1.0, 3.0],
         dir=[-0.4, -0.45, -0.8],
@@ -263,7 +161,7 @@ def _set_scene(mujoco: Any, spec: Any) -> None:
         castshadow=False,
     )
     spec.add_texture(
-        name="cell/sky",
+        name=f"{_CELL}/sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
         rgb1=[0.62, 0.62, 0.62],
@@ -280,7 +178,7 @@ def _grey(value: float) -> list[float]:
 def _add_surroundings(mujoco: Any, spec: Any, cell: Cell) -> None:
     for box in cell.surroundings:
         spec.worldbody.add_geom(
-            name=f"cell/{box.name}",
+            name=f"{_CELL}/{box.name}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=0.5e-3 * np.array(box.size_mm),
             pos=box.position_m,
@@ -290,16 +188,21 @@ def _add_surroundings(mujoco: Any, spec: Any, cell: Cell) -> None:
 
 
 def _add_cameras(mujoco: Any, spec: Any, cell: Cell) -> None:
-    """Housings stand behind the optical centre, out of their own view."""
+    """Cameras, and housings behind the optical centre."""
     for camera in cell.cameras:
         world_from_camera = camera.world_from_camera
+        spec.worldbody.add_camera(
+            name=f"{_CELL}/{camera.name}",
+            pos=world_from_camera.translation,
+            quat=quaternion_wxyz(world_from_camera.rotation @ _OPTICAL_FROM_MUJOCO),
+        )
         parts = (
             ("lens", mujoco.mjtGeom.mjGEOM_CYLINDER, [0.016, 0.015, 0.0], -0.02),
             ("body", mujoco.mjtGeom.mjGEOM_BOX, [0.022, 0.022, 0.03], -0.065),
         )
         for part, shape, size, depth in parts:
             spec.worldbody.add_geom(
-                name=f"cell/camera {camera.name} {part}",
+                name=f"{_CELL}/camera {camera.name} {part}",
                 type=shape,
                 size=size,
                 pos=world_from_camera.apply([0.0, 0.0, depth]),
@@ -309,17 +212,17 @@ def _add_cameras(mujoco: Any, spec: Any, cell: Cell) -> None:
             )
 
 
-def _add_rig(mujoco: Any, spec: Any, cell: Cell, frames: _Frames) -> None:
+def _add_rig(mujoco: Any, spec: Any, cell: Cell, frames: ArmFrames) -> None:
     """Attach the markers and the rods that hold them, in the flange frame."""
-    rig = spec.body(_ARM + frames.flange_body).add_body(
-        name=_RIG,
+    rig = spec.body(ARM_PREFIX + frames.flange_body).add_body(
+        name=RIG,
         pos=frames.body_from_flange.translation,
         quat=quaternion_wxyz(frames.body_from_flange.rotation),
     )
-    steel = spec.add_material(name=f"{_RIG}/rod", rgba=_grey(_GREYS["rod"]))
+    steel = spec.add_material(name=f"{RIG}/rod", rgba=_grey(_GREYS["rod"]))
     for rod in rig_rods(cell.rig):
         rig.add_geom(
-            name=f"{_RIG}/{rod.name}",
+            name=f"{RIG}/{rod.name}",
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,
             size=[rod.radius, 0.0, 0.0],
             fromto=[*rod.start, *rod.end],
@@ -330,14 +233,14 @@ def _add_rig(mujoco: Any, spec: Any, cell: Cell, frames: _Frames) -> None:
     for k, letter in enumerate("ABC"):
         # Light of its own and no highlight: lit spheres have biased centres.
         paint = spec.add_material(
-            name=f"{_RIG}/paint {letter}",
+            name=f"{RIG}/paint {letter}",
             rgba=[*cell.rig.marker_colours[k], 1.0],
             emission=1.0,
             specular=0.0,
             shininess=0.0,
         )
         rig.add_geom(
-            name=f"{_RIG}/marker {letter}",
+            name=f"{RIG}/marker {letter}",
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
             size=[1e-3 * cell.rig.marker_radii_mm[k], 0.0, 0.0],
             pos=markers[k],
@@ -346,96 +249,167 @@ def _add_rig(mujoco: Any, spec: Any, cell: Cell, frames: _Frames) -> None:
         )
 
 
-_SHAPES: dict[int, Shape] = {
-    0: "plane",
-    2: "sphere",
-    3: "capsule",
-    4: "ellipsoid",
-    5: "cylinder",
-    6: "box",
-    7: "mesh",
-    8: "mesh",
-}
-_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "ellipsoid": 3}
-_KINDS: dict[int, JointKind] = {2: "slide", 3: "hinge"}
+def execute(arm: Arm, plan: Plan, repeatability: Repeatability, seed: int) -> Floats:
+    """Where the robot truly goes when it is told to follow a plan.
+
+    The robot reports the commanded pose; it stands at commanded @ exp(xi), xi
+    normal with the repeatability as its standard deviation, one draw per station.
+
+    Returns:
+        Joints, shape (stations, q), rad or m.
+
+    Raises:
+        InputError: the plan's stations carry no joints of this arm.
+    """
+    sigma = np.repeat([repeatability.translation, repeatability.rotation], 3)
+    joints = []
+    for station in plan.stations:
+        if station.joints.shape != arm.home.shape:
+            raise InputError(
+                f"station {station.index} of the plan has {station.joints.size} "
+                f"joints, the arm has {arm.home.size}; plan again for this arm"
+            )
+        rng = np.random.default_rng([seed, _ROBOT_STREAM, station.index])
+        joints.append(arm.perturbed(station.joints, sigma * rng.standard_normal(6)))
+    return np.array(joints)
 
 
-def _mechanism(cell: Cell, path: Path, model: Any, frames: _Frames) -> Mechanism:
-    """Copy the compiled arrays: all numbers stay float64, nothing is re-parsed."""
-    bodies = tuple(
-        Body(
-            _name(model.body(k), "body"),
-            int(model.body_parentid[k]),
-            _pose(model.body_pos[k], model.body_quat[k]),
-        )
-        for k in range(model.nbody)
-    )
-    base = _ARM + frames.base if frames.base else _STAND
-    excluded = ((int(s) >> 16, int(s) & 0xFFFF) for s in model.exclude_signature)
-    return Mechanism(
-        bodies=bodies,
-        joints=tuple(_joint(model, k, frames.speeds) for k in range(model.njnt)),
-        geometries=tuple(_geometry(path, model, k) for k in range(model.ngeom)),
-        base=frames.base or "world",
-        flange=cell.arm.flange,
-        base_body=model.body(base).id,
-        flange_body=model.body(_ARM + frames.flange_body).id,
-        body_from_flange=frames.body_from_flange,
-        marker_body=model.body(_RIG).id,
-        markers=cell.rig.flange_from_triangle.apply(cell.rig.triangle.points),
-        touching=frozenset((min(pair), max(pair)) for pair in excluded),
-    )
+def ground_truth(cell: Cell, arm: Arm, joints: ArrayLike) -> GroundTruth:
+    """The truth of a simulated cell in the robot's base frame.
 
-
-def _name(item: Any, kind: str) -> str:
-    """Name in the arm's own model, or one made up from the index."""
-    name: str = item.name.removeprefix(_ARM)
-    return name or f"{kind} {item.id}"
-
-
-def _joint(model: Any, k: int, speeds: dict[str, float]) -> Joint:
-    name = _name(model.joint(k), "joint")
-    limited = bool(model.jnt_limited[k])
-    lower, upper = model.jnt_range[k] if limited else (-np.inf, np.inf)
-    return Joint(
-        name=name,
-        body=int(model.jnt_bodyid[k]),
-        kind=_KINDS[int(model.jnt_type[k])],
-        anchor=np.array(model.jnt_pos[k]),
-        axis=np.array(model.jnt_axis[k]),
-        lower=float(lower),
-        upper=float(upper),
-        reference=float(model.qpos0[model.jnt_qposadr[k]]),
-        speed=speeds.get(name, np.inf),
+    Args:
+        cell: True cameras, where they stand, and the rig.
+        arm: The robot.
+        joints: Executed joints, shape (n, q), rad or m.
+    """
+    return GroundTruth(
+        cameras=tuple(camera.camera for camera in cell.cameras),
+        base_from_camera=tuple(
+            arm.base_from_world @ camera.world_from_camera for camera in cell.cameras
+        ),
+        flange_from_triangle=cell.rig.flange_from_triangle,
+        base_from_flange=arm.forward(joints),
     )
 
 
-def _geometry(path: Path, model: Any, k: int) -> Geometry:
-    body = int(model.geom_bodyid[k])
-    name = _name(model.geom(k), f"{_name(model.body(body), 'body')}/solid")
-    shape = _SHAPES.get(int(model.geom_type[k]))
-    if shape is None:
+def check_rendering() -> None:
+    """Draw a few pixels.
+
+    Raises:
+        MissingDependencyError: that fails; names the Debian packages.
+    """
+    mujoco = _mujoco()
+    spec = mujoco.MjSpec()
+    _set_scene(mujoco, spec)
+    with _canvas(mujoco, spec.compile(), 8, 8):
+        pass
+
+
+@contextmanager
+def _canvas(mujoco: Any, model: Any, width: int, height: int) -> Iterator[Any]:
+    """An off-screen picture of a size; yields what the renderer draws with.
+
+    Raises:
+        MissingDependencyError: OpenGL is absent or fails.
+    """
+    model.vis.global_.offwidth = width
+    model.vis.global_.offheight = height
+    try:
+        context = mujoco.GLContext(width, height)
+    except (ImportError, AttributeError, RuntimeError, OSError) as error:
+        raise MissingDependencyError(_MISSING_GL.format(_one_line(error))) from None
+    try:
+        context.make_current()
+        try:
+            painter = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except mujoco.FatalError as error:
+            raise MissingDependencyError(_MISSING_GL.format(_one_line(error))) from None
+        try:
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, painter)
+            yield painter
+        finally:
+            painter.free()
+    finally:
+        context.free()
+
+
+def _eye(mujoco: Any, model: Any, name: str, pinhole: Pinhole) -> Any:
+    """Give a camera of the model its intrinsics; returns what draws through it."""
+    index = model.camera(f"{_CELL}/{name}").id
+    size = np.array(pinhole.size, dtype=float)
+    # A sensor of 1 x 1; the principal point counts from the picture's middle, left
+    # and up positive. The picture's edges lie half a pixel beyond pixel centres.
+    offset = 0.5 * (size - 1.0) - pinhole.principal_point
+    model.cam_resolution[index] = pinhole.size
+    model.cam_sensorsize[index] = 1.0
+    model.cam_intrinsic[index] = [*(pinhole.focal / size), *(offset / size)]
+    eye = mujoco.MjvCamera()
+    eye.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    eye.fixedcamid = index
+    return eye
+
+
+def render_views(
+    cell: Cell,
+    model_path: Path,
+    joints: ArrayLike,
+    seed: int,
+    wanted: Iterable[tuple[int, int]],
+) -> Iterator[tuple[int, int, Image]]:
+    """Photograph the arm at its stations.
+
+    Args:
+        cell: The cell.
+        model_path: MJCF or URDF of the arm.
+        joints: True joints at the n stations, shape (n, q), rad or m.
+        seed: Of the sensor noise; each view has its own stream.
+        wanted: Pairs (camera index, station index).
+
+    Yields:
+        Camera index, station index, and the image: RGB, shape (h, w, 3), or (h, w)
+        in a grey cell; in the order of ``wanted``.
+
+    Raises:
+        InputError: as :func:`compile_mechanism`; the joints do not fit the arm; or
+            a lens cannot be inverted inside its image.
+        MissingDependencyError: OpenGL is missing.
+    """
+    mujoco = _mujoco()
+    model, mechanism = _compile(cell, model_path)
+    order = [int(model.jnt_qposadr[k]) for k in mechanism.arm_joints]
+    q = np.asarray(joints, dtype=float)
+    if q.ndim != 2 or q.shape[1] != len(order):
         raise InputError(
-            f"{path}: geom {name!r} is a height field, which is not supported; "
-            "use boxes or a mesh"
+            f"joints must have shape (stations, {len(order)}) for this arm, "
+            f"got {q.shape}"
         )
-    vertices, faces = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
-    if shape == "mesh":
-        mesh = int(model.geom_dataid[k])
-        start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        vertices = np.array(model.mesh_vert[start : start + count], dtype=float)
-        start, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-        faces = np.array(model.mesh_face[start : start + count], dtype=np.int64)
-    material = int(model.geom_matid[k])
-    rgba = model.geom_rgba[k] if material < 0 else model.mat_rgba[material]
-    return Geometry(
-        name=name,
-        body=body,
-        shape=shape,
-        size=np.array(model.geom_size[k][: _SIZES.get(shape, 0)]),
-        body_from_geometry=_pose(model.geom_pos[k], model.geom_quat[k]),
-        vertices=vertices,
-        faces=faces,
-        rgba=np.array(rgba, dtype=float),
-        collides=bool(model.geom_contype[k] or model.geom_conaffinity[k]),
-    )
+    scale = cell.imaging.supersample
+    optics = [Optics.of(camera.camera, scale) for camera in cell.cameras]
+    eyes = [
+        _eye(mujoco, model, camera.name, view.pinhole)
+        for camera, view in zip(cell.cameras, optics, strict=True)
+    ]
+    sizes = scale * np.array([view.pinhole.size for view in optics])
+    data = mujoco.MjData(model)
+    scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 100)
+    options = mujoco.MjvOption()
+    options.sitegroup[:] = 0
+    for flag in ("SHADOW", "REFLECTION"):
+        scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = 0
+    with _canvas(mujoco, model, *(int(x) for x in sizes.max(axis=0))) as painter:
+        for i, j in wanted:
+            data.qpos[:] = model.qpos0
+            data.qpos[order] = q[j]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_camlight(model, data)
+            mujoco.mjv_updateScene(
+                model, data, options, None, eyes[i], mujoco.mjtCatBit.mjCAT_ALL, scene
+            )
+            width, height = (int(x) for x in sizes[i])
+            area = mujoco.MjrRect(0, 0, width, height)
+            picture = np.empty((height, width, 3), dtype=np.uint8)
+            mujoco.mjr_render(area, scene, painter)
+            mujoco.mjr_readPixels(picture, None, area, painter)
+            rng = np.random.default_rng([seed, _SENSOR_STREAM, i, j])
+            # OpenGL's first row is the lowest.
+            yield i, j, develop(optics[i], cell.imaging, picture[::-1], rng)
