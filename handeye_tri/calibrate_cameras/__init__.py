@@ -3,9 +3,11 @@
 One camera from half-turns of the triangle (Zhao, Liu and Zhang 2008,
 doi:10.1109/TIP.2008.2005562, Sec. III): special_motion (III-A, B, C), homography and
 closed_form (the same constraints, whitened), extrinsics (III-D), refine (III-E),
-degeneracy (III-F).
+degeneracy (III-F). Several cameras: bundle (all of them and the triangle's poses
+adjusted together), eccentricity (of a sphere's outline), session (every step in order).
 """
 
+from handeye_tri.calibrate_cameras.session import calibrate_session_cameras
 from handeye_tri.calibrate_cameras.single_camera import calibrate_camera
 
-__all__ = ["calibrate_camera"]
+__all__ = ["calibrate_camera", "calibrate_session_cameras"]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.calibrate_cameras.closed_form import NOMINAL_FOCAL
+from handeye_tri.calibrate_cameras.half_turns import HalfTurnData
 from handeye_tri.calibrate_cameras.homography import Homographies, vanishing_lines
 from handeye_tri.calibrate_cameras.special_motion import foot_fraction
 from handeye_tri.errors import DegenerateMotionError
@@ -25,6 +26,9 @@ Floats = NDArray[np.float64]
 _MIN_OFF_RIGHT_ANGLE = np.radians(1.0)
 # Planes closer to parallel than this are one plane for any practical noise.
 _MIN_PLANE_SPREAD_DEG = 0.5
+# Homography residual over the triangle's mean side in the image; 2 degrees off a
+# half-turn make about 0.01.
+_MAX_TURN_RESIDUAL = 0.05
 # A focal length whose sigma is a larger part of it than this is not determined.
 _MAX_RELATIVE_SIGMA = 0.5
 # Scaled information worse conditioned than this is singular in double precision.
@@ -84,6 +88,31 @@ def check_axis_ends(triangle: TriangleRig, axes: Sequence[Axis]) -> None:
                     "image and that end are in line, and each half-turn gives one "
                     f"constraint instead of two; turn about the longest edge {longest}"
                 )
+
+
+def check_turns(
+    data: HalfTurnData, homographies: Homographies, used: NDArray[np.intp]
+) -> None:
+    """Refuse images that are no half-turn about the stated axis, whatever K is.
+
+    One plane must map to both images of a half-turn. An inexact robot misses that by
+    pixels; a wrong axis, triangle or marker order by a good part of the triangle.
+
+    Raises:
+        DegenerateMotionError: names the worst half-turn and its residual.
+    """
+    first = data.pixels[:, 0]
+    side = np.linalg.norm(first - np.roll(first, -1, axis=1), axis=-1).mean(axis=1)
+    worst = int(np.argmax(homographies.residual_px / side))
+    residual = float(homographies.residual_px[worst])
+    if residual <= _MAX_TURN_RESIDUAL * side[worst]:
+        return
+    raise DegenerateMotionError(
+        f"half-turn {used[worst]} is no half-turn about {data.axes[worst]!r}: no plane "
+        f"fits the images before and after it, RMS residual {residual:.2f} px for a "
+        f"triangle of {side[worst]:.0f} px; check the axis, the triangle, the order of "
+        "A, B, C and which images belong together"
+    )
 
 
 def plane_spread_deg(normals: Floats) -> float:

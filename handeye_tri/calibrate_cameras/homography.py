@@ -9,6 +9,7 @@ all that the half-turn says of the camera: h1' w h2 = 0, h1' w h1 = h2' w h2.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,6 +28,7 @@ from handeye_tri.calibrate_cameras.special_motion import (
     diagonals_meet,
     homogeneous,
 )
+from handeye_tri.errors import DegenerateMotionError
 
 Floats = NDArray[np.float64]
 OMode = Literal["shared", "free", "known"]
@@ -78,6 +80,7 @@ class Homographies:
         size: Metres.
         image: The image coordinates.
         chi2: Sum of squared whitened residuals.
+        residual_px: Root mean square residual of each half-turn, shape (n,), pixels.
         dof: Observations less unknowns.
     """
 
@@ -88,6 +91,7 @@ class Homographies:
     size: float
     image: ImageScale
     chi2: float
+    residual_px: Floats
     dof: int
 
 
@@ -109,6 +113,9 @@ def fit_homographies(
 
     Returns:
         The homographies with covariances that take a shared O into account.
+
+    Raises:
+        DegenerateMotionError: the images admit no homography.
     """
     image = ImageScale.of(data.image_size)
     observed = image.normalised(data.pixels)
@@ -171,21 +178,21 @@ def fit_homographies(
 
     rounding = float(np.finfo(float).eps * whitener.max())
     end = minimise(evaluate, retract, start, rounding, max_iterations=30)
-    if end is None:
-        # The linear start put a marker behind the camera; it stays a start.
-        return Homographies(
-            start.matrix,
-            np.broadcast_to(np.eye(8), (n, 8, 8)),
-            start.o,
-            origin,
-            size,
-            image,
-            np.inf,
-            1,
+    covariance = None
+    if end is not None:
+        with contextlib.suppress(np.linalg.LinAlgError):
+            covariance = NormalEquations.of(end.blocks).own_covariance()[:, :8, :8]
+    if end is None or covariance is None:
+        raise DegenerateMotionError(
+            "no plane maps to the images before and after the half-turns with every "
+            "marker in front of the camera; check axis, triangle and the order of A, "
+            "B, C"
         )
+    missed = np.linalg.solve(
+        data.whitener, end.blocks.residuals.reshape(n, 2, 3, 2)[..., None]
+    )
     normals = int(data.about_normal.sum())
     feet_unknown = (2 if shared_o else 2 * normals) if estimated else 0
-    covariance = NormalEquations.of(end.blocks).own_covariance()[:, :8, :8]
     return Homographies(
         end.state.matrix,
         covariance,
@@ -194,6 +201,7 @@ def fit_homographies(
         size,
         image,
         end.cost,
+        np.sqrt(np.mean(missed**2, axis=(1, 2, 3, 4))),
         max(12 * n - 8 * n - feet_unknown, 1),
     )
 

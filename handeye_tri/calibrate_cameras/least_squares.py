@@ -21,6 +21,8 @@ _START_DAMPING = 1e-4
 _MAX_DAMPING = 1e12
 # (step / sigma)^2 of the last step taken; the one after would be its square.
 _RELATIVE_TOLERANCE = 1e-9
+# Minima whose costs differ by a smaller part than this are one minimum.
+_SAME_COST = 1e-3
 
 
 class Linearised(Protocol):
@@ -68,12 +70,12 @@ class Blocks:
     @property
     def observations(self) -> int:
         """Number of residuals."""
-        return self.residuals.size
+        return int(self.residuals.size)
 
     @property
     def unknowns(self) -> int:
         """Number of unknowns, own and shared."""
-        return len(self.own) * self.own.shape[-1] + self.shared.shape[-1]
+        return int(self.own[:, 0].size + self.shared.shape[-1])
 
     def equations(self) -> NormalEquations:
         """The normal equations at this state."""
@@ -188,6 +190,7 @@ def minimise(
     retract: Callable[[State, Floats, Floats], State],
     start: State,
     rounding: float,
+    known: float | None = None,
     max_iterations: int = 100,
 ) -> Minimum[State, Rows] | None:
     """Levenberg-Marquardt with Nielsen's damping rule (IMM-REP-1999-05).
@@ -197,6 +200,8 @@ def minimise(
         retract: Moves a state by steps (n, l) and (g,).
         start: Where to begin.
         rounding: Root mean square of whitened residuals that is rounding only.
+        known: Cost of a minimum found before. The iteration ends, not converged,
+            where a short step is predicted to reach the same cost.
         max_iterations: Upper limit of evaluations.
 
     Returns:
@@ -221,6 +226,12 @@ def minimise(
             damping, growth = damping * growth, 2 * growth
             continue
         negligible = gain <= max(_RELATIVE_TOLERANCE * cost / freedom, floor)
+        if (
+            known is not None
+            and gain < 0.1 * known
+            and abs(cost - gain - known) < _SAME_COST * known
+        ):
+            break
         candidate = retract(state, d_own, d_shared)
         tried = evaluate(candidate)
         tried_cost = np.inf if tried is None else tried.cost

@@ -43,6 +43,14 @@ class State:
     turn: Floats
 
 
+def _cayley(rotation_vector: Floats) -> Floats:
+    """Rotations that agree with exp to second order and cost a quarter of it."""
+    skew = hat(0.5 * rotation_vector)
+    square = 0.25 * np.einsum("ni,ni->n", rotation_vector, rotation_vector)
+    factor = (2.0 / (1.0 + square))[:, None, None]
+    return np.asarray(np.eye(3) + factor * (skew + skew @ skew))
+
+
 class HalfTurnModel:
     """Residuals and analytic derivatives of n half-turns.
 
@@ -88,11 +96,20 @@ class HalfTurnModel:
         return len(self.intrinsics) + len(self.lens)
 
     @property
+    def own_unknowns(self) -> int:
+        """Number of unknowns of each half-turn."""
+        return 6 + 2 * self.free_o + 6 * (self.turn_root is not None)
+
+    @property
+    def shared_unknowns(self) -> int:
+        """Number of unknowns that all half-turns share."""
+        return self.camera_unknowns + 2 * self.shared_o
+
+    @property
     def dof(self) -> int:
         """Observations less unknowns; a prior counts as an observation."""
-        feet = 2 if self.shared_o else 2 * int(self.data.about_normal.sum())
-        feet = feet if self.shared_o or self.free_o else 0
-        return 6 * len(self.data) - self.camera_unknowns - feet
+        feet = 2 * int(self.data.about_normal.sum()) if self.free_o else 0
+        return 6 * len(self.data) - self.shared_unknowns - feet
 
     def with_lens(self, lens: tuple[int, ...]) -> HalfTurnModel:
         """The same model with these lens coefficients estimated."""
@@ -164,61 +181,46 @@ class HalfTurnModel:
         by_point = np.zeros((n, 2, 3, 2, 3))
         by_point[..., 0, 0] = by_point[..., 1, 1] = inverse[..., 0]
         by_point[..., 2] = -xy * inverse
+        by_xy = upper
         if self.lens or state.lens.any():
-            xy, by_xy, by_lens = distort_jacobians(state.lens, xy)
-            by_point = (upper @ by_xy) @ by_point
-        else:
-            by_point = upper @ by_point
-        whitener = self.data.whitener
-        pixels = xy @ upper.T
-        pixels += (cx, cy)
-        residuals = whitener @ (pixels - self.data.pixels)[..., None]
+            xy, by_lens_xy, by_lens = distort_jacobians(state.lens, xy)
+            by_xy = upper @ by_lens_xy
+        by_point = by_xy @ by_point @ state.poses[:, None, None, :3, :3]
 
-        by_point = whitener @ by_point @ state.poses[:, None, None, :3, :3]
-        own = [by_point, -by_point @ hat(points)]
-        by_o = None
+        # Columns: own unknowns, shared unknowns, residual.
+        size, count = self.own_unknowns, self.camera_unknowns
+        columns = np.zeros((n, 2, 3, 2, size + self.shared_unknowns + 1))
+        columns[..., :3] = by_point
+        columns[..., 3:6] = -by_point @ hat(points)
         if self.shared_o or self.free_o:
-            by_o = np.zeros((n, 2, 3, 2, 2))
+            at = 6 if self.free_o else size + count
             reach = (2.0 * self.data.about_normal)[:, None, None, None]
-            by_o[:, 1] = by_point[:, 1, ..., :2] * reach
-        if self.free_o and by_o is not None:
-            own.append(by_o)
+            columns[:, 1, ..., at : at + 2] = by_point[:, 1, ..., :2] * reach
         if by_turn is not None:
-            by_xi = np.zeros((n, 2, 3, 2, 6))
-            by_xi[:, 1] = by_point[:, 1] @ by_turn
-            own.append(by_xi)
-
-        by_camera = np.zeros((n, 2, 3, 2, 5))
-        by_camera[..., 0, 0] = xy[..., 0]
-        by_camera[..., 1, 1] = by_camera[..., 0, 2] = xy[..., 1]
-        by_camera[..., 0, 3] = by_camera[..., 1, 4] = 1.0
-        shared = [whitener @ by_camera[..., self.intrinsics]]
+            columns[:, 1, ..., size - 6 : size] = by_point[:, 1] @ by_turn
+        columns[..., 0, size] = xy[..., 0]
+        columns[..., 1, size + 1] = xy[..., 1]
+        columns[..., 0, size + len(self.intrinsics) - 2] = 1.0
+        columns[..., 1, size + len(self.intrinsics) - 1] = 1.0
+        if 2 in self.intrinsics:
+            columns[..., 0, size + 2] = xy[..., 1]
         if self.lens:
-            shared.append(whitener @ (upper @ by_lens[..., self.lens]))
-        if self.shared_o and by_o is not None:
-            shared.append(by_o)
-        blocks = Blocks(
-            residuals.reshape(n, 12),
-            np.concatenate(own, axis=-1).reshape(n, 12, -1),
-            np.concatenate(shared, axis=-1).reshape(n, 12, -1),
-        )
-        if self.turn_root is None:
-            return blocks
-        prior = np.zeros((n, 6, blocks.own.shape[-1]))
-        prior[..., -6:] = np.eye(6)
-        return Blocks(
-            np.concatenate([blocks.residuals, state.turn], axis=1),
-            np.concatenate([blocks.own, prior], axis=1),
-            np.concatenate(
-                [blocks.shared, np.zeros((n, 6, blocks.shared.shape[-1]))], axis=1
-            ),
-        )
+            start = size + len(self.intrinsics)
+            columns[..., start : size + count] = upper @ by_lens[..., self.lens]
+        columns[..., -1] = xy @ upper.T + (cx, cy) - self.data.pixels
+        rows = (self.data.whitener @ columns).reshape(n, 12, -1)
+        if self.turn_root is not None:
+            prior = np.zeros((n, 6, rows.shape[-1]))
+            prior[..., size - 6 : size] = np.eye(6)
+            prior[..., -1] = state.turn
+            rows = np.concatenate([rows, prior], axis=1)
+        return Blocks(rows[..., -1], rows[..., :size], rows[..., size:-1])
 
     def retract(self, state: State, own: Floats, shared: Floats) -> State:
         """Move a state by steps of own (n, l) and shared (g,) unknowns."""
         poses = state.poses.copy()
         poses[:, :3, 3] += (poses[:, :3, :3] @ own[:, :3, None])[..., 0]
-        poses[:, :3, :3] = poses[:, :3, :3] @ so3_exp(own[:, 3:6])
+        poses[:, :3, :3] = poses[:, :3, :3] @ _cayley(own[:, 3:6])
         intrinsics, lens, o = state.intrinsics.copy(), state.lens, state.o
         count = len(self.intrinsics)
         intrinsics[list(self.intrinsics)] += shared[:count]
@@ -273,9 +275,11 @@ def refine_from_starts(
     best: Minimum[State, Blocks] | None = None
     chosen = 0
     for index, start in enumerate(starts):
-        end = minimise(pinhole.evaluate, pinhole.retract, start, rounding)
-        # A second start is believed only where it is better by more than rounding.
-        if end is not None and (best is None or end.cost < best.cost * (1 - 1e-6)):
+        known = None if best is None else best.cost
+        end = minimise(pinhole.evaluate, pinhole.retract, start, rounding, known)
+        if end is None:
+            continue
+        if best is None or (end.converged, -end.cost) > (best.converged, -best.cost):
             best, chosen = end, index
     if best is None or not model.lens:
         return None if best is None else (best, chosen)

@@ -19,6 +19,7 @@ from handeye_tri.calibrate_cameras.degeneracy import (
     check_count,
     check_determined,
     check_planes,
+    check_turns,
     least_noise,
     plane_spread_deg,
     scaled_condition,
@@ -154,11 +155,12 @@ def calibrate_camera(
     check_count(
         len(data),
         skew,
-        model.camera_unknowns + 2 * model.shared_o,
+        model.shared_unknowns,
         4 if model.free_o else 6,
     )
     check_axis_ends(triangle, data.axes)
     homographies = fit_homographies(data, o_mode, known_o)
+    check_turns(data, homographies, used)
     check_planes(homographies, noise_known)
 
     first: ClosedForm | None = None
