@@ -23,7 +23,7 @@ ROWS: tuple[tuple[str, ...], ...] = (
     # A cell hands out records of what the estimators may know of it.
     ("config",),
     # Plain numpy below what talks to an engine: arm, simulate.
-    ("kinematics", "rig"),
+    ("kinematics", "imaging", "model_arrays", "rig", "solids"),
     ("storage", "arm", "exchange"),
     ("plan", "synthesize", "simulate", "detect"),
     ("calibrate_cameras",),

@@ -14,8 +14,8 @@ from handeye_tri.se3 import SE3
 
 Floats = NDArray[np.float64]
 
-# Determinant of two rays' normal equations, their squared angle to first order,
-# below which they are as good as parallel (1e-6 rad: they meet beyond 250 km).
+# Determinant of two rays' normal equations, twice their squared angle, below which
+# they are as good as parallel (0.7e-6 rad: at a baseline of 0.25 m, 350 km away).
 _PARALLEL = 1e-12
 # Gauss-Newton ends at steps this short beside the point's distance from the origin.
 _STEP_TOLERANCE = 1e-13
@@ -92,7 +92,8 @@ def triangulate(
             weighted = np.swapaxes(jacobian, -1, -2) @ weight[i, used[visible]]
             normal[visible] += weighted @ jacobian
             gradient[visible] += (weighted @ residual[..., None])[..., 0]
-        used, x, normal, gradient = (a[ahead] for a in (used, x, normal, gradient))
+        used, x = used[ahead], x[ahead]
+        normal, gradient = normal[ahead], gradient[ahead]
         step = np.linalg.solve(normal, gradient[..., None])[..., 0]
         x = x + step
         limit = _STEP_TOLERANCE * (1 + np.linalg.norm(x, axis=-1))

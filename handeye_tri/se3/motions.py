@@ -1,9 +1,7 @@
-"""Rigid motions, safe at rotation 0 and at rotation pi.
+"""Rigid motions in batches, and the one motion that records carry.
 
-The batched functions on arrays serve the estimators; :class:`SE3` is the one
-motion that records carry. Tangent vectors are (translation, rotation), in
-metres and radians. Formulas: T. Barfoot, State Estimation for Robotics,
-Cambridge 2017, Sec. 7.1 (doi:10.1017/9781316671528).
+Formulas: T. Barfoot, State Estimation for Robotics, Cambridge 2017, Sec. 7.1
+(doi:10.1017/9781316671528).
 """
 
 from __future__ import annotations
@@ -14,205 +12,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handeye_tri.errors import InputError
+from handeye_tri.errors import ConvergenceError, InputError
+from handeye_tri.se3.rotations import (
+    angle_coefficients,
+    hat,
+    nearest_rotation,
+    so3_exp,
+    so3_left_jacobian,
+    so3_left_jacobian_inverse,
+    so3_log,
+)
 
 Floats = NDArray[np.float64]
 
-# Below this angle the closed-form coefficients lose digits to cancellation; the
-# first term left out of the series, angle^8 / 9!, is 3e-14 of the last one there.
-_SMALL_ANGLE = 0.1
-# The same for coefficients that divide by angle^5.
-_SMALL_ANGLE_Q = 0.4
+# Below this angle, coefficients that divide by angle^5 lose digits to cancellation.
+_SMALL_ANGLE = 0.4
 # A matrix whose R'R is farther than this from the identity is no rotation.
 _ROTATION_TOLERANCE = 1e-6
-
-
-def hat(vector: ArrayLike) -> Floats:
-    """Cross-product matrices of vectors: ``hat(a) @ b == cross(a, b)``.
-
-    Args:
-        vector: Shape (..., 3).
-
-    Returns:
-        Shape (..., 3, 3).
-    """
-    v = np.asarray(vector, dtype=float)
-    matrix = np.zeros((*v.shape[:-1], 3, 3))
-    matrix[..., 0, 1] = -v[..., 2]
-    matrix[..., 0, 2] = v[..., 1]
-    matrix[..., 1, 0] = v[..., 2]
-    matrix[..., 1, 2] = -v[..., 0]
-    matrix[..., 2, 0] = -v[..., 1]
-    matrix[..., 2, 1] = v[..., 0]
-    return matrix
-
-
-def _series(angle: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return sin(t)/t, (1-cos t)/t^2 and (t-sin t)/t^3, accurate near t = 0."""
-    square = angle * angle
-    small = angle < _SMALL_ANGLE
-    safe = np.where(small, 1.0, angle)
-    half = np.sin(0.5 * safe) / safe
-    first = np.where(
-        small,
-        1 - square / 6 * (1 - square / 20 * (1 - square / 42)),
-        np.sin(safe) / safe,
-    )
-    second = np.where(
-        small,
-        0.5 - square / 24 * (1 - square / 30 * (1 - square / 56)),
-        2.0 * half * half,
-    )
-    third = np.where(
-        small,
-        1 / 6 - square / 120 * (1 - square / 42 * (1 - square / 72)),
-        (safe - np.sin(safe)) / safe**3,
-    )
-    return first, second, third
-
-
-def so3_exp(rotation_vector: ArrayLike) -> Floats:
-    """Rotation matrices of rotation vectors (Rodrigues).
-
-    Args:
-        rotation_vector: Shape (..., 3), radians.
-
-    Returns:
-        Shape (..., 3, 3).
-    """
-    w = np.asarray(rotation_vector, dtype=float)
-    sine, cosine, _ = _series(np.linalg.norm(w, axis=-1))
-    skew = hat(w)
-    result: Floats = (
-        np.eye(3)
-        + sine[..., None, None] * skew
-        + cosine[..., None, None] * (skew @ skew)
-    )
-    return result
-
-
-def so3_left_jacobian(rotation_vector: ArrayLike) -> Floats:
-    """Left Jacobian of SO(3): ``exp(w + dw) ~ exp(J dw) exp(w)``.
-
-    Args:
-        rotation_vector: Shape (..., 3), radians.
-
-    Returns:
-        Shape (..., 3, 3).
-    """
-    w = np.asarray(rotation_vector, dtype=float)
-    _, cosine, third = _series(np.linalg.norm(w, axis=-1))
-    skew = hat(w)
-    result: Floats = (
-        np.eye(3)
-        + cosine[..., None, None] * skew
-        + third[..., None, None] * (skew @ skew)
-    )
-    return result
-
-
-def so3_left_jacobian_inverse(rotation_vector: ArrayLike) -> Floats:
-    """Inverse of :func:`so3_left_jacobian`; regular up to and including pi.
-
-    Args:
-        rotation_vector: Shape (..., 3), radians, norm below 2 pi.
-
-    Returns:
-        Shape (..., 3, 3).
-    """
-    w = np.asarray(rotation_vector, dtype=float)
-    angle = np.linalg.norm(w, axis=-1)
-    square = angle * angle
-    small = angle < _SMALL_ANGLE
-    safe = np.where(small, 1.0, angle)
-    closed = (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2
-    factor = np.where(
-        small, 1 / 12 + square / 720 * (1 + square / 42 * (1 + square / 40)), closed
-    )
-    skew = hat(w)
-    result: Floats = np.eye(3) - 0.5 * skew + factor[..., None, None] * (skew @ skew)
-    return result
-
-
-def quaternion_wxyz(rotation: ArrayLike) -> Floats:
-    """Unit quaternions (w, x, y, z), w >= 0, of rotation matrices.
-
-    The largest of the four components is the divisor (Shepperd 1978,
-    doi:10.2514/3.55767b), so that w = 0, a half-turn, keeps all its digits.
-
-    Args:
-        rotation: Shape (..., 3, 3).
-
-    Returns:
-        Shape (..., 4).
-    """
-    r = np.asarray(rotation, dtype=float)
-    trace = np.trace(r, axis1=-2, axis2=-1)
-    # Outer product 4 q q' of the quaternion: the best-conditioned row is used.
-    outer = np.empty((*r.shape[:-2], 4, 4))
-    outer[..., 0, 0] = 1 + trace
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        outer[..., i + 1, i + 1] = 1 + 2 * r[..., i, i] - trace
-        outer[..., 0, i + 1] = outer[..., i + 1, 0] = r[..., k, j] - r[..., j, k]
-        outer[..., i + 1, j + 1] = r[..., i, j] + r[..., j, i]
-        outer[..., j + 1, i + 1] = outer[..., i + 1, j + 1]
-    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
-    row = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
-    row /= np.linalg.norm(row, axis=-1, keepdims=True)
-    sign = np.where(row[..., :1] < 0, -1.0, 1.0)
-    return np.asarray(sign * row)
-
-
-def rotation_from_quaternion_wxyz(quaternion: ArrayLike) -> Floats:
-    """Rotation matrices of quaternions (w, x, y, z), normalised here.
-
-    Args:
-        quaternion: Shape (..., 4), any non-zero length.
-
-    Returns:
-        Shape (..., 3, 3).
-    """
-    q = np.asarray(quaternion, dtype=float)
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    skew = hat(q[..., 1:])
-    result: Floats = np.eye(3) + 2 * (q[..., :1, None] * skew + skew @ skew)
-    return result
-
-
-def so3_log(rotation: ArrayLike) -> Floats:
-    """Rotation vectors of rotation matrices, norm in [0, pi].
-
-    At exactly pi the axis has two signs; the first non-zero component of the
-    quaternion's vector keeps the sign that :func:`quaternion_wxyz` gives it.
-
-    Args:
-        rotation: Shape (..., 3, 3).
-
-    Returns:
-        Shape (..., 3), radians.
-    """
-    q = quaternion_wxyz(rotation)
-    w, v = q[..., 0], q[..., 1:]
-    sine = np.linalg.norm(v, axis=-1)
-    small = sine < 1e-8
-    scale = np.where(small, 2.0, 2.0 * np.arctan2(sine, w) / np.where(small, 1.0, sine))
-    return np.asarray(scale[..., None] * v)
-
-
-def nearest_rotation(matrix: ArrayLike) -> Floats:
-    """Rotations closest in the Frobenius norm (orthogonal Procrustes).
-
-    Args:
-        matrix: Shape (..., 3, 3).
-
-    Returns:
-        Shape (..., 3, 3), determinant +1.
-    """
-    u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=float))
-    sign = np.linalg.det(u @ vt)
-    u = u * np.stack([np.ones_like(sign), np.ones_like(sign), sign], -1)[..., None, :]
-    return np.asarray(u @ vt)
 
 
 def se3_exp(tangent: ArrayLike) -> Floats:
@@ -282,9 +98,9 @@ def se3_left_jacobian_inverse(tangent: ArrayLike) -> Floats:
     rho, phi = hat(xi[..., :3]), hat(xi[..., 3:])
     angle = np.linalg.norm(xi[..., 3:], axis=-1)
     square = angle * angle
-    small = angle < _SMALL_ANGLE_Q
+    small = angle < _SMALL_ANGLE
     safe = np.where(small, 1.0, angle)
-    _, _, first = _series(angle)
+    _, _, first = angle_coefficients(angle)
     second = np.where(
         small,
         1 / 24 - square / 720 * (1 - square / 56 * (1 - square / 90)),
@@ -378,10 +194,19 @@ class SE3:
 
     @classmethod
     def from_parts(cls, rotation: ArrayLike, translation: ArrayLike) -> SE3:
-        """Join a rotation, shape (3, 3), and a translation, shape (3,), metres."""
+        """Join a rotation, shape (3, 3), and a translation, shape (3,), metres.
+
+        Raises:
+            InputError: wrong shape, NaN, or not a rotation.
+        """
+        r, t = np.asarray(rotation, dtype=float), np.asarray(translation, dtype=float)
+        if r.shape != (3, 3) or t.shape != (3,):
+            raise InputError(
+                "a rigid motion has a rotation of shape (3, 3) and a translation of "
+                f"shape (3,), got {r.shape} and {t.shape}"
+            )
         m = np.eye(4)
-        m[:3, :3] = np.asarray(rotation, dtype=float)
-        m[:3, 3] = np.asarray(translation, dtype=float)
+        m[:3, :3], m[:3, 3] = r, t
         return cls(m)
 
     @classmethod
@@ -390,14 +215,16 @@ class SE3:
         return cls(se3_exp(tangent))
 
     @classmethod
-    def mean(cls, motions: Iterable[SE3], iterations: int = 20) -> SE3:
-        """Fréchet mean: the motion whose mean tangent to all others is zero.
+    def mean(cls, motions: Iterable[SE3], iterations: int = 100) -> SE3:
+        """Mean of rotations and mean of translations, each in its own space.
 
-        Rotation by the intrinsic mean of SO(3) (Moakher 2002,
-        doi:10.1137/S0895479801383877), translation by the arithmetic mean.
+        Rotation by the intrinsic mean of SO(3), about which the mean rotation
+        vector is zero (Moakher 2002, doi:10.1137/S0895479801383877); translation by
+        the arithmetic mean, so that it does not depend on the rotations.
 
         Raises:
             InputError: no motion was given.
+            ConvergenceError: the rotations are spread too far to have one mean.
         """
         matrices = np.array([motion.matrix for motion in motions])
         if len(matrices) == 0:
@@ -406,8 +233,14 @@ class SE3:
         for _ in range(iterations):
             step = so3_log(rotation.T @ matrices[:, :3, :3]).mean(axis=0)
             rotation = rotation @ so3_exp(step)
-            if np.linalg.norm(step) < 1e-15:
+            if np.linalg.norm(step) < 1e-14:
                 break
+        else:
+            raise ConvergenceError(
+                f"the mean of {len(matrices)} rotations still moves by "
+                f"{np.linalg.norm(step):.1e} rad after {iterations} steps: they are "
+                "spread too far to have one mean; average those near each other"
+            )
         return cls.from_parts(rotation, matrices[:, :3, 3].mean(axis=0))
 
     @property
