@@ -1,0 +1,396 @@
+"""Maximum-likelihood adjustment of m cameras that see one known triangle.
+
+Unknown are the intrinsics and lenses of all cameras, where the cameras stand to each
+other, and the triangle's pose at every station; known are the triangle's sides and the
+covariance of every detected point. Zhao, Liu and Zhang 2008
+(doi:10.1109/TIP.2008.2005562), Appendix A, step (e), extended by half-turns that tie
+two stations together as far as the robot repeats them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handeye_tri.calibrate_cameras.bundle_input import (
+    check_links,
+    observations,
+    pairs,
+    start_poses,
+    unknowns,
+)
+from handeye_tri.calibrate_cameras.bundle_model import (
+    BundleModel,
+    Linearisation,
+    State,
+    Turns,
+)
+from handeye_tri.calibrate_cameras.degeneracy import scaled_condition
+from handeye_tri.calibrate_cameras.least_squares import Minimum, minimise
+from handeye_tri.camera import INTRINSIC_NAMES, Intrinsics, Lens, PinholeCamera
+from handeye_tri.errors import ConvergenceError, DegenerateMotionError, InputError
+from handeye_tri.records import (
+    CameraCalibration,
+    Covariance,
+    HalfTurn,
+    motion_labels,
+)
+from handeye_tri.se3 import SE3
+from handeye_tri.triangle import EDGES, Axis, TriangleRig
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+# A focal length whose sigma is a larger part of it than this is not determined.
+_MAX_RELATIVE_SIGMA = 0.5
+# Scaled information worse conditioned than this is singular in double precision.
+_MAX_CONDITION = 1e14
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnNoise:
+    """How far half-turns may be trusted.
+
+    Attributes:
+        covariance: Of the tangent xi (translation m, rotation rad) by which a half-turn
+            misses, ``after = before @ half_turn @ exp(xi)`` in the triangle's
+            frame, shape (6, 6); zero for a perfect robot. The line itself, where the
+            half-turns' axis truly runs in the triangle's frame, is estimated.
+        on_axis_correlation: Correlation of a marker's detection errors before and
+            after, for the two markers on an edge axis. They are seen twice at the same
+            place, and what a detector gets wrong there, it gets wrong twice.
+    """
+
+    covariance: Floats
+    on_axis_correlation: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raise InputError where this is no covariance or no correlation."""
+        matrix = np.asarray(self.covariance, dtype=float)
+        if matrix.shape != (6, 6) or not np.isfinite(matrix).all():
+            raise InputError(
+                f"a turn's covariance must be finite, shape (6, 6), got {matrix.shape}"
+            )
+        # Metres and radians differ in size: judge each entry against its own scale.
+        root = np.sqrt(np.abs(np.diagonal(matrix)))
+        scaled = matrix / np.outer(*[np.where(root > 0, root, 1.0)] * 2)
+        if (
+            np.abs(scaled - scaled.T).max() > 1e-9
+            or np.linalg.eigvalsh(scaled)[0] < -1e-9
+        ):
+            raise InputError(
+                "a turn's covariance must be symmetric and positive semi-definite"
+            )
+        if not 0 <= self.on_axis_correlation < 1:
+            raise InputError(
+                "on_axis_correlation must be at least 0 and below 1, "
+                f"got {self.on_axis_correlation}"
+            )
+
+    @property
+    def root(self) -> Floats:
+        """A square root of the covariance, shape (6, 6)."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def bundle_cameras(
+    cameras: Sequence[PinholeCamera],
+    reference_from_camera: Sequence[SE3],
+    reference_from_triangle: ArrayLike,
+    pixels: ArrayLike,
+    covariance: ArrayLike,
+    triangle: TriangleRig,
+    *,
+    skew: bool | Sequence[bool] = True,
+    lenses: Sequence[Sequence[str]] | None = None,
+    half_turns: Sequence[HalfTurn] = (),
+    turn_noise: TurnNoise | None = None,
+    huber: float | None = None,
+) -> CameraCalibration:
+    """Adjust all cameras, their places and the triangle's poses together.
+
+    The first camera is the reference. The cost is that of the likelihood: pixel
+    residuals whitened by each point's covariance, and the deviations of the
+    half-turns whitened by theirs. Stations are eliminated from the normal equations, a
+    half-turn's two together, so that the cost grows in proportion to the stations.
+
+    Args:
+        cameras: Where to start: m cameras, 1 or more.
+        reference_from_camera: Where they stand at the start; the first is moved to the
+            identity and everything else with it.
+        reference_from_triangle: Start of the triangle's poses, (n, 4, 4), metres; not
+            read at stations that cannot be used.
+        pixels: Shape (m, n, 3, 2); NaN where a camera does not see a marker. Stations
+            at which not every marker is seen by some camera are not used.
+        covariance: Shape (m, n, 3, 2, 2), px^2; not read where unseen.
+        triangle: The rig, whose sides are taken for exact.
+        skew: Whether skew is estimated, for all cameras or one by one; elsewhere it
+            keeps its start.
+        lenses: Names of the lens coefficients to estimate, one sequence per camera;
+            others keep their start. None estimates none.
+        half_turns: Which stations are half-turns of each other. A station takes part
+            in one at most. Only used with ``turn_noise``.
+        turn_noise: How far they may be trusted. None leaves stations independent, which
+            one camera cannot do with.
+        huber: Distance in sigmas beyond which a point counts linearly; None for none.
+
+    Returns:
+        The cameras. ``residuals`` has one view per station. ``covariance`` has the
+        estimated quantities only. ``details`` has:
+
+        - "reference_from_triangle": (n, 4, 4), and "station_covariance" of its tangents
+          (n, 6, 6), NaN where not used;
+        - "used": indices of the stations used; "iterations";
+        - with turn noise, "turn_sigmas": (len(half_turns), 6), the deviation of each
+          half-turn over its prior's root, NaN where not used; "axes": the names of the
+          axes and "triangle_from_axis": (a, 4, 4), whose z axes are where they run.
+
+    Raises:
+        InputError: an argument cannot be used; names it.
+        DegenerateMotionError: the stations do not determine the cameras.
+        ConvergenceError: the iteration did not settle.
+    """
+    m = len(cameras)
+    observed, weights = observations(m, pixels, covariance)
+    inner, outer = unknowns(cameras, skew, lenses)
+    if len(reference_from_camera) != m:
+        raise InputError(
+            f"reference_from_camera must have one motion for each of the {m} cameras, "
+            f"got {len(reference_from_camera)}"
+        )
+    names = [camera.name for camera in cameras]
+    if len(set(names)) < m:
+        raise InputError(f"camera names must differ, got {names}")
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(observed).all(axis=-1))
+    used = np.flatnonzero(seen.any(axis=0).all(axis=-1))
+    check_links(names, seen[:, used])
+    poses = start_poses(reference_from_triangle, observed.shape[1], used)
+    if turn_noise is None:
+        blocks, members = used[:, None], np.empty(0, dtype=np.intp)
+        kinds: tuple[Axis, ...] = ()
+    else:
+        blocks, kinds, members = pairs(half_turns, used, observed.shape[1])
+    present = blocks >= 0
+    turns = None
+    if turn_noise is not None:
+        turns = _turns(half_turns, members, len(blocks), kinds, turn_noise)
+    model = BundleModel(
+        triangle.points,
+        np.where(seen[:, blocks, :, None], observed[:, blocks], 0.0),
+        weights[:, blocks] * present[..., None, None, None],
+        inner,
+        outer,
+        turns,
+        np.inf if huber is None else huber,
+    )
+    origin = reference_from_camera[0].inverse().matrix
+    start = State(
+        np.array([camera.intrinsics.vector for camera in cameras]),
+        tuple(camera.lens.coefficients for camera in cameras),
+        origin @ np.array([motion.matrix for motion in reference_from_camera]),
+        origin @ poses[blocks[:, 0]],
+        np.zeros((len(blocks), 0 if turns is None else 6)),
+        np.array([_nominal_axis(triangle, kind) for kind in kinds]).reshape(-1, 4, 4),
+    )
+    start.reference_from_camera[0] = np.eye(4)
+    end = _minimum(model, start, names)
+    return _result(
+        model, end, cameras, blocks, members, len(half_turns), kinds, seen.shape[1]
+    )
+
+
+def _turns(
+    half_turns: Sequence[HalfTurn],
+    members: Indices,
+    blocks: int,
+    kinds: tuple[Axis, ...],
+    noise: TurnNoise,
+) -> Turns:
+    if len(members) == 0:
+        raise InputError(
+            "turn_noise needs half_turns of which both stations are seen; there are "
+            "none: give them, or leave turn_noise out"
+        )
+    paired = np.arange(blocks) < len(members)
+    kind = np.zeros(blocks, dtype=np.intp)
+    correlation = np.zeros((blocks, 3))
+    for block, index in enumerate(members):
+        axis = half_turns[index].axis
+        kind[block] = kinds.index(axis)
+        if axis != "normal":
+            correlation[block, list(EDGES[axis])] = noise.on_axis_correlation
+    return Turns(paired, kind, np.broadcast_to(noise.root, (blocks, 6, 6)), correlation)
+
+
+def _nominal_axis(triangle: TriangleRig, axis: Axis) -> Floats:
+    """A frame (4, 4) whose z axis is the axis as built: normals at the circumcentre."""
+    frame = np.eye(4)
+    if axis == "normal":
+        frame[:2, 3] = triangle.circumcentre
+        return frame
+    start, end = triangle.points[list(EDGES[axis])]
+    along = (end - start) / np.linalg.norm(end - start)
+    normal = np.array([0.0, 0.0, 1.0])
+    frame[:3, :3] = np.stack([np.cross(normal, along), normal, along], axis=1)
+    frame[:3, 3] = start
+    return frame
+
+
+def _minimum(
+    model: BundleModel, start: State, names: Sequence[str]
+) -> Minimum[State, Linearisation]:
+    first = model.evaluate(start)
+    if first is None:
+        raise InputError(
+            "reference_from_triangle or reference_from_camera puts a seen marker "
+            "behind its camera; start from better poses"
+        )
+    freedom = first.observations - first.unknowns
+    if freedom < 1:
+        raise DegenerateMotionError(
+            f"{first.observations} observations are too few for {first.unknowns} "
+            f"unknowns of {len(names)} camera(s) and "
+            f"{int(model.seen.any(axis=(0, 3)).sum())} poses; add stations, cameras or "
+            "half-turns with turn_noise, or estimate fewer lens coefficients"
+        )
+    largest = float(np.abs(model.pixels).max())
+    rounding = float(np.finfo(float).eps * largest * np.abs(model.whitener).max())
+    end = minimise(model.evaluate, model.retract, start, rounding)
+    assert end is not None
+    return end
+
+
+def _camera_labels(
+    cameras: Sequence[PinholeCamera], model: BundleModel
+) -> tuple[list[str], list[int]]:
+    """Labels of the cameras' unknowns, intrinsics before places, and their columns."""
+    inner: list[tuple[str, int]] = []
+    places: list[tuple[str, int]] = []
+    for i, camera in enumerate(cameras):
+        labels = [INTRINSIC_NAMES[index] for index in model.intrinsics[i]]
+        labels += [camera.lens.names[index] for index in model.lenses[i]]
+        start = model.columns[i].start
+        inner += [
+            (f"{camera.name}.{label}", start + j) for j, label in enumerate(labels)
+        ]
+        if i:
+            start += len(labels)
+            places += [
+                (label, start + j)
+                for j, label in enumerate(
+                    motion_labels(f"reference_from_{camera.name}")
+                )
+            ]
+    both = inner + places
+    return [label for label, _ in both], [column for _, column in both]
+
+
+def _result(
+    model: BundleModel,
+    end: Minimum[State, Linearisation],
+    cameras: Sequence[PinholeCamera],
+    blocks: Indices,
+    members: Indices,
+    half_turns: int,
+    kinds: tuple[Axis, ...],
+    n: int,
+) -> CameraCalibration:
+    state, normal = end.state, end.blocks.normal
+    information = normal.reduced()
+    condition = scaled_condition(information)
+    labels, columns = _camera_labels(cameras, model)
+    if condition > _MAX_CONDITION:
+        raise DegenerateMotionError(
+            f"the cameras are not determined (condition {condition:.2g} of "
+            f"{len(labels)} unknowns): the triangle's planes may be parallel at all "
+            "stations; tilt it at least 20 degrees between stations, or estimate fewer "
+            "lens coefficients"
+        )
+    scale = 1.0 / np.sqrt(np.diagonal(information))
+    shared = np.linalg.inv(information * np.outer(scale, scale))
+    shared = 0.5 * (shared + shared.T) * np.outer(scale, scale)
+    covariance = Covariance(tuple(labels), shared[np.ix_(columns, columns)])
+    for camera, vector in zip(cameras, state.intrinsics, strict=True):
+        for label, focal in zip(("fx", "fy"), vector[:2], strict=True):
+            sigma = covariance.std(f"{camera.name}.{label}")
+            if sigma > _MAX_RELATIVE_SIGMA * focal:
+                raise DegenerateMotionError(
+                    f"{camera.name}.{label} = {focal:.1f} px has a predicted sigma of "
+                    f"{sigma:.1f} px: the stations do not determine it; add stations "
+                    "with the triangle tilted at least 20 degrees and larger in the "
+                    "image"
+                )
+    if not end.converged:
+        raise ConvergenceError(
+            f"the adjustment did not settle in {end.iterations} iterations (chi2 "
+            f"{end.cost_start:.4g} to {end.cost:.4g}); start nearer, or estimate fewer "
+            "lens coefficients"
+        )
+    calibrated = tuple(
+        PinholeCamera(
+            camera.name,
+            Intrinsics.from_vector(state.intrinsics[i]),
+            camera.image_size,
+            Lens(camera.lens.model, state.lenses[i]),
+        )
+        for i, camera in enumerate(cameras)
+    )
+    present = blocks >= 0
+    residuals = np.full((len(cameras), n, 3, 2), np.nan)
+    residuals[:, blocks[present]] = np.where(
+        model.seen[..., None], -end.blocks.residuals, np.nan
+    )[:, present]
+    details = {
+        "reference_from_triangle": _whole(
+            model.poses(state)[present], blocks[present], n
+        ),
+        "station_covariance": _whole(
+            _station_covariance(model, end, shared)[present], blocks[present], n
+        ),
+        "used": np.sort(blocks[present]),
+        "iterations": end.iterations,
+    }
+    if model.turns is not None:
+        details["turn_sigmas"] = _whole(state.turn[: len(members)], members, half_turns)
+        details["axes"] = kinds
+        details["triangle_from_axis"] = state.lines
+    return CameraCalibration(
+        cameras=calibrated,
+        reference_from_camera=tuple(SE3(m) for m in state.reference_from_camera),
+        covariance=covariance,
+        chi2=end.cost,
+        dof=end.blocks.observations - end.blocks.unknowns,
+        residuals=residuals,
+        condition=condition,
+        cost_start=end.cost_start,
+        method="bundle adjustment"
+        + ("" if model.turns is None else " with half-turns")
+        + (f", huber {model.huber:g}" if np.isfinite(model.huber) else ""),
+        details=details,
+    )
+
+
+def _whole(values: Floats, rows: Indices, n: int) -> Floats:
+    """Values in the order of all n stations or half-turns, NaN where unused; locked."""
+    result = np.full((n, *values.shape[1:]), np.nan)
+    result[rows] = values
+    result.setflags(write=False)
+    return result
+
+
+def _station_covariance(
+    model: BundleModel, end: Minimum[State, Linearisation], shared: Floats
+) -> Floats:
+    """Marginal covariance of each station's tangent, shape (b, w, 6, 6)."""
+    normal = end.blocks.normal
+    gain = np.linalg.solve(normal.own, normal.cross)
+    spread = gain @ shared
+    own = np.linalg.inv(normal.own) + spread @ np.swapaxes(gain, -1, -2)
+    lines = shared[model.cameras_stop :, model.cameras_stop :]
+    below = np.broadcast_to(lines, (len(own), *lines.shape))
+    cross = np.concatenate([-spread[..., model.cameras_stop :], below], axis=1)
+    return model.station_covariance(end.state, own, cross)
