@@ -311,11 +311,19 @@ def _baseline(
     true: dict[str, SE3],
 ) -> Comparison:
     """Distance between the first camera and another, with its sigma."""
-    motion = estimated[f"reference_from_{name}"]
-    length = float(np.linalg.norm(motion.translation))
-    truth = float(np.linalg.norm(true[f"reference_from_{name}"].translation))
-    # |t| under the right tangent: t moves by R d_t.
-    direction = motion.rotation.T @ motion.translation / length
-    block = calibration.covariance.block(motion_labels(f"reference_from_{name}")[:3])
-    sigma = float(np.sqrt(direction @ block @ direction))
+    motion = f"reference_from_{name}"
+    length = float(np.linalg.norm(estimated[motion].translation))
+    truth = float(np.linalg.norm(true[motion].translation))
+    # A centre t moves by R d_t under its motion's right tangent.
+    ends = {motion: estimated[motion].translation}
+    if isinstance(calibration, HandEyeCalibration):
+        first = f"base_from_{calibration.cameras[0].name}"
+        other = f"base_from_{name}"
+        between = estimated[other].translation - estimated[first].translation
+        ends = {first: -between, other: between}
+    labels = [label for end in ends for label in motion_labels(end)[:3]]
+    slope = np.concatenate(
+        [vector @ estimated[end].rotation / length for end, vector in ends.items()]
+    )
+    sigma = float(np.sqrt(slope @ calibration.covariance.block(labels) @ slope))
     return Comparison(f"baseline.{name}", length, truth, length - truth, sigma)
