@@ -1,0 +1,10 @@
+"""The stages in order, from a cell's description to its report.
+
+A stage whose inputs and outputs are unchanged is not done again.
+"""
+
+from handeye_tri.pipeline.execution import Stage, execute
+from handeye_tri.pipeline.run import Progress, Run, start
+from handeye_tri.pipeline.stages import STAGES, VERBS
+
+__all__ = ["STAGES", "VERBS", "Progress", "Run", "Stage", "execute", "start"]

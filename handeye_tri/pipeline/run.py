@@ -1,0 +1,197 @@
+"""A session being worked on: what its stages share, read back from disk."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from handeye_tri import storage
+from handeye_tri.errors import InputError
+from handeye_tri.records import (
+    CameraCalibration,
+    GroundTruth,
+    HandEyeCalibration,
+    Plan,
+    Session,
+)
+from handeye_tri.storage import SessionFolder, codec
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from handeye_tri.arm import Arm
+    from handeye_tri.config import Cell
+    from handeye_tri.mechanism import Mechanism
+
+PLAN_SCHEMA = "handeye_tri.plan/1"
+TRUTH_SCHEMA = "handeye_tri.truth/1"
+CAMERAS_SCHEMA = "handeye_tri.cameras/1"
+HAND_EYE_SCHEMA = "handeye_tri.hand_eye/1"
+EVALUATION_SCHEMA = "handeye_tri.evaluation/1"
+_PACKAGES = (
+    "handeye-tri",
+    "numpy",
+    "scipy",
+    "mujoco",
+    "pin",
+    "opencv-python-headless",
+    "rerun-sdk",
+)
+
+
+class Progress(Protocol):
+    """What a stage tells while it runs; the command line draws it."""
+
+    def begin(self, number: int, total: int, stage: str) -> None:
+        """A stage starts."""
+
+    def advance(self, done: int, total: int) -> None:
+        """So much of the stage is done."""
+
+    def end(self, line: str, seconds: float | None) -> None:
+        """The stage ended with its own quality figure; None: it was up to date."""
+
+
+def software() -> dict[str, str]:
+    """Versions of what computes the numbers."""
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "absent"
+    return found
+
+
+def start(
+    cell_name: str, out: Path, seed: int, half_turns: int | None
+) -> SessionFolder:
+    """Check a cell and take a folder for it; writes nothing.
+
+    Raises:
+        InputError: the cell or the model cannot be used.
+        StorageError: the folder holds something else.
+    """
+    path = storage.find_cell(cell_name)
+    cell = storage.read_cell(path)
+    model = storage.find_model(cell, path)
+    if seed < 0:
+        raise InputError(f"--seed must not be negative, got {seed}")
+    return SessionFolder.prepare(
+        out,
+        {
+            "schema": "handeye_tri.session/1",
+            "software": software(),
+            "cell": cell.model_dump(mode="json", by_alias=True),
+            "cell_file": str(path),
+            "model_file": str(model),
+            "seed": seed,
+            "half_turns": cell.plan.half_turns if half_turns is None else half_turns,
+            "simulated": True,
+            "stages": {},
+        },
+    )
+
+
+class Run:
+    """A session with what its stages share."""
+
+    def __init__(self, folder: SessionFolder, progress: Progress) -> None:
+        self.folder = folder
+        self.progress = progress
+
+    @cached_property
+    def cell(self) -> Cell:
+        """The cell's description."""
+        return self.folder.cell
+
+    @property
+    def seed(self) -> int:
+        """The seed of everything random."""
+        return int(self.folder.header["seed"])
+
+    @property
+    def model_path(self) -> Path:
+        """The arm's model."""
+        return Path(self.folder.header["model_file"])
+
+    @cached_property
+    def mechanism(self) -> Mechanism:
+        """The compiled cell."""
+        from handeye_tri.simulate import compile_mechanism
+
+        return compile_mechanism(self.cell, self.model_path)
+
+    @cached_property
+    def arm(self) -> Arm:
+        """Kinematics and collisions of the compiled cell."""
+        from handeye_tri.arm import Arm
+
+        return Arm(self.mechanism)
+
+    def plan(self) -> Plan:
+        """The programme, read back."""
+        return storage.decoded(
+            self.folder.file("plan.json"), PLAN_SCHEMA, codec.plan_from_json
+        )
+
+    def truth(self) -> tuple[GroundTruth, NDArray[np.float64]] | None:
+        """The ground truth and executed joints, where there are any."""
+        if not self.folder.header["simulated"]:
+            return None
+        return storage.decoded(
+            self.folder.file("truth.json"), TRUTH_SCHEMA, codec.truth_from_json
+        )
+
+    def cameras(self) -> CameraCalibration:
+        """The calibrated cameras, read back."""
+        return storage.decoded(
+            self.folder.file("cameras.json"),
+            CAMERAS_SCHEMA,
+            codec.camera_calibration_from_json,
+        )
+
+    def hand_eye(self) -> HandEyeCalibration:
+        """The calibrated cell, read back."""
+        return storage.decoded(
+            self.folder.file("hand_eye.json"), HAND_EYE_SCHEMA, codec.hand_eye_from_json
+        )
+
+    def image_name(self, camera: str, station: int) -> str:
+        """Name of the file of one view."""
+        return f"images/{camera}_{station:03d}.png"
+
+    def image(self, camera: str, station: int) -> NDArray[np.uint8]:
+        """One view, read back."""
+        return storage.read_image(self.folder.file(self.image_name(camera, station)))
+
+    def evaluation(self) -> dict[str, Any]:
+        """The evaluation as it stands in evaluation.json."""
+        return storage.read_json(self.folder.file("evaluation.json"), EVALUATION_SCHEMA)
+
+    def written(self) -> list[str]:
+        """Files that a person opens, where they are there, first one first."""
+        names = ("report.html", "replay.rrd", "evaluation.json", "hand_eye.json")
+        return [name for name in names if self.folder.file(name).is_file()]
+
+    def session(self) -> Session:
+        """What the estimators get to know."""
+        arrays = storage.read_arrays(
+            self.folder.file("observations.npz"), ("pixels", "pixel_covariance")
+        )
+        plan = self.plan()
+        return Session(
+            triangle=self.cell.rig.triangle,
+            marker_radii=1e-3 * np.array(self.cell.rig.marker_radii_mm),
+            cameras=tuple(camera.info for camera in self.cell.cameras),
+            stations=plan.stations,
+            half_turns=plan.half_turns,
+            pixels=arrays["pixels"],
+            pixel_covariance=arrays["pixel_covariance"],
+            repeatability=self.cell.repeatability,
+            simulated=bool(self.folder.header["simulated"]),
+        )

@@ -1,0 +1,267 @@
+"""What each stage does: from the session's files to the session's files.
+
+Each stage reads what it needs back from disk, so that a session gives the same
+numbers whether it ran in one go or was taken up again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+
+from handeye_tri import storage
+from handeye_tri.errors import InputError
+from handeye_tri.pipeline.execution import Stage
+from handeye_tri.pipeline.run import (
+    CAMERAS_SCHEMA,
+    EVALUATION_SCHEMA,
+    HAND_EYE_SCHEMA,
+    PLAN_SCHEMA,
+    TRUTH_SCHEMA,
+    Run,
+)
+from handeye_tri.storage import codec
+from handeye_tri.summary import result_rows
+
+
+def _plan(run: Run) -> tuple[list[str], str]:
+    from handeye_tri.plan import plan_motions
+
+    plan = plan_motions(
+        run.cell,
+        run.arm,
+        run.seed,
+        half_turns=int(run.folder.header["half_turns"]),
+        progress=run.progress.advance,
+    )
+    storage.write_json(
+        run.folder.file("plan.json"),
+        {"schema": PLAN_SCHEMA, **codec.plan_to_json(plan)},
+    )
+    spread = plan.certificate["plane_spread_deg"]
+    held_out = sum(s.kind == "evaluation" for s in plan.stations)
+    return ["plan.json"], (
+        f"{len(plan.half_turns)} half-turns, {len(plan.stations) - held_out} stations "
+        f"+ {held_out} held out; successive planes at least {spread:.0f} deg apart"
+    )
+
+
+def _simulate(run: Run) -> tuple[list[str], str]:
+    from concurrent.futures import ThreadPoolExecutor
+
+    from handeye_tri import simulate
+
+    plan = run.plan()
+    joints = simulate.execute(run.arm, plan, run.cell.repeatability, run.seed)
+    truth = simulate.ground_truth(run.cell, run.arm, joints)
+    storage.write_json(
+        run.folder.file("truth.json"),
+        {"schema": TRUTH_SCHEMA, **codec.truth_to_json(truth, joints)},
+    )
+    names = [camera.name for camera in run.cell.cameras]
+    views = [(i, j) for j in range(len(plan.stations)) for i in range(len(names))]
+    # Views that an interrupted run left are used only if they are of this very task.
+    task = {"joints": joints.tolist(), "cell": run.folder.header["cell"]}
+    started = storage.fingerprint({**task, "seed": run.seed}).encode()
+    mark = run.folder.file("images/.started")
+    missing = views
+    if mark.is_file() and mark.read_bytes() == started:
+        missing = [
+            (i, j)
+            for i, j in views
+            if not run.folder.file(run.image_name(names[i], j)).is_file()
+        ]
+    else:
+        for old in run.folder.file("images").glob("*.png"):
+            old.unlink()
+        storage.write_bytes(mark, started)
+    done = len(views) - len(missing)
+    with ThreadPoolExecutor(1) as writer:
+        pending = []
+        for i, j, image in simulate.render_views(
+            run.cell, run.model_path, joints, run.seed, missing
+        ):
+            path = run.folder.file(run.image_name(names[i], j))
+            pending.append(writer.submit(storage.write_image, path, image))
+            done += 1
+            run.progress.advance(done, len(views))
+        for future in pending:
+            future.result()
+    mark.unlink()
+    outputs = ["truth.json", *(run.image_name(names[i], j) for i, j in views)]
+    return outputs, f"{len(plan.stations)} stations, {len(views)} images"
+
+
+def _detect(run: Run) -> tuple[list[str], str]:
+    from handeye_tri.detect import MarkerSpec, detect_markers
+
+    spec = MarkerSpec.from_rig(run.cell.rig)
+    cameras = run.cell.cameras
+    stations = len(run.plan().stations)
+    pixels = np.full((len(cameras), stations, 3, 2), np.nan)
+    covariance = np.full((len(cameras), stations, 3, 2, 2), np.nan)
+    for i, camera in enumerate(cameras):
+        for j in range(stations):
+            name = run.image_name(camera.name, j)
+            image = run.image(camera.name, j)
+            if image.shape[1::-1] != camera.image_size_px:
+                raise InputError(
+                    f"{run.folder.file(name)}: the image is "
+                    f"{image.shape[1]} x {image.shape[0]} pixels, the cell says "
+                    f"{camera.image_size_px[0]} x {camera.image_size_px[1]}"
+                )
+            found = detect_markers(image, spec)
+            pixels[i, j], covariance[i, j] = found.pixels, found.covariance
+            run.progress.advance(i * stations + j + 1, len(cameras) * stations)
+    storage.write_arrays(
+        run.folder.file("observations.npz"),
+        {"pixels": pixels, "pixel_covariance": covariance},
+    )
+    seen = np.isfinite(pixels).all(axis=-1)
+    lacking = [
+        f"station {j} lacks {'ABC'[k]} ({cameras[i].name})"
+        for i, j, k in np.argwhere(~seen)
+    ]
+    sigma = float(np.sqrt(np.nanmedian(covariance[..., [0, 1], [0, 1]])))
+    line = f"{int(seen.sum())} of {seen.size} markers, sigma {sigma:.3f} px"
+    if lacking:
+        line += "; " + "; ".join(lacking[:3]) + (" ..." if len(lacking) > 3 else "")
+    return ["observations.npz"], line
+
+
+def _cameras(run: Run) -> tuple[list[str], str]:
+    from handeye_tri.calibrate_cameras import calibrate_session_cameras
+
+    result = calibrate_session_cameras(run.session())
+    storage.write_json(
+        run.folder.file("cameras.json"),
+        {"schema": CAMERAS_SCHEMA, **codec.camera_calibration_to_json(result)},
+    )
+    return ["cameras.json"], (
+        f"{', '.join(camera.name for camera in result.cameras)} from "
+        f"{len(run.plan().half_turns)} half-turns; "
+        f"chi2/dof {result.chi2 / result.dof:.2f} (1 = noise as assumed)"
+    )
+
+
+def _hand_eye(run: Run) -> tuple[list[str], str]:
+    from handeye_tri.hand_eye import calibrate_hand_eye
+
+    result = calibrate_hand_eye(run.session(), run.cameras())
+    storage.write_json(
+        run.folder.file("hand_eye.json"),
+        {"schema": HAND_EYE_SCHEMA, **codec.hand_eye_to_json(result)},
+    )
+    translation = 1e3 * np.sqrt((result.residuals[:, :3] ** 2).sum(axis=1).mean())
+    rotation = np.degrees(np.sqrt((result.residuals[:, 3:] ** 2).sum(axis=1).mean()))
+    return ["hand_eye.json"], (
+        f"{len(result.residuals)} stations; loop {translation:.3f} mm "
+        f"{rotation:.4f} deg; chi2/dof {result.chi2 / result.dof:.2f}"
+    )
+
+
+def _evaluate(run: Run) -> tuple[list[str], str]:
+    from handeye_tri.diagnose import assess
+    from handeye_tri.evaluate import compare_with_truth, evaluate_track, track_budget
+
+    session, cameras, hand_eye = run.session(), run.cameras(), run.hand_eye()
+    track = evaluate_track(hand_eye, session)
+    budget = track_budget(hand_eye, session)
+    verdict = assess(
+        session,
+        cameras,
+        hand_eye,
+        track,
+        track_limit=1e-3 * run.cell.track_limit_mm,
+        min_plane_spread=float(np.radians(run.cell.plan.min_plane_spread_deg)),
+    )
+    truth = run.truth()
+    rows = compare_with_truth(hand_eye, truth[0]) if truth else ()
+    worst = int(np.argmax(track.distances))
+    data = {
+        "schema": EVALUATION_SCHEMA,
+        "verdict": verdict.outcome,
+        "sentence": verdict.sentence,
+        "nearest": verdict.nearest,
+        "simulated": session.simulated,
+        "gates": [asdict(gate) for gate in verdict.gates],
+        "findings": [asdict(finding) for finding in verdict.findings],
+        "cameras_chi2_per_dof": cameras.chi2 / cameras.dof,
+        "hand_eye_chi2_per_dof": hand_eye.chi2 / hand_eye.dof,
+        "track": {
+            "stations": len(set(track.stations.tolist())),
+            "mean_mm": 1e3 * track.mean,
+            "rms_mm": 1e3 * track.rms,
+            "max_mm": 1e3 * track.max,
+            "worst_station": int(track.stations[worst]),
+            "worst_marker": "ABC"[track.markers[worst]],
+            "predicted_rms_mm": 1e3 * track.predicted_rms,
+            "predicted_parts_mm": {
+                name: 1e3 * value for name, value in asdict(budget).items()
+            },
+            "positions": [
+                {
+                    "station": int(track.stations[r]),
+                    "marker": "ABC"[track.markers[r]],
+                    "reported_m": track.reported[r].tolist(),
+                    "observed_m": track.observed[r].tolist(),
+                    "error_mm": 1e3 * float(track.distances[r]),
+                }
+                for r in range(len(track.stations))
+            ],
+        },
+        "result": result_rows(hand_eye, truth[0] if truth else None),
+        "truth": {
+            row.quantity: {
+                "estimate": row.estimate,
+                "truth": row.truth,
+                "error": row.error,
+                "sigma": row.sigma,
+            }
+            for row in rows
+        },
+    }
+    storage.write_json(run.folder.file("evaluation.json"), data)
+    return ["evaluation.json"], (
+        f"held-out track {1e3 * track.mean:.3f} mm mean, {1e3 * track.max:.3f} worst; "
+        f"predicted {1e3 * track.predicted_rms:.3f} rms; {verdict.outcome}"
+    )
+
+
+STAGES = {
+    stage.name: stage
+    for stage in (
+        Stage(
+            "plan",
+            "plan",
+            ("arm", "rig", "cameras", "surroundings", "plan"),
+            (),
+            _plan,
+        ),
+        Stage(
+            "simulate",
+            "simulate",
+            ("arm", "rig", "cameras", "surroundings", "imaging"),
+            ("plan",),
+            _simulate,
+        ),
+        Stage("detect", "detect", ("rig", "cameras"), ("simulate",), _detect),
+        Stage("cameras", "calibrate", ("rig", "arm"), ("plan", "detect"), _cameras),
+        Stage(
+            "hand_eye",
+            "calibrate",
+            ("rig", "arm"),
+            ("plan", "detect", "cameras"),
+            _hand_eye,
+        ),
+        Stage(
+            "evaluate",
+            "evaluate",
+            ("rig", "arm", "plan", "track_limit_mm"),
+            ("plan", "simulate", "detect", "cameras", "hand_eye"),
+            _evaluate,
+        ),
+    )
+}
+VERBS = tuple(dict.fromkeys(stage.verb for stage in STAGES.values()))

@@ -1,0 +1,209 @@
+"""The result as text for a terminal: verdict first, digits after the uncertainty."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.camera import INTRINSIC_NAMES, PinholeCamera
+from handeye_tri.records import GroundTruth, HandEyeCalibration, motion_labels
+from handeye_tri.se3 import SE3, so3_left_jacobian_inverse, so3_log
+
+Floats = NDArray[np.float64]
+_WIDTH = 88
+
+
+def digits(sigma: float) -> int:
+    """Decimals that show two significant digits of a standard deviation."""
+    if not math.isfinite(sigma) or sigma <= 0:
+        return 4
+    return max(0, 1 - math.floor(math.log10(sigma)))
+
+
+def summary_text(
+    evaluation: Mapping[str, Any], folder: Path, written: Sequence[str]
+) -> str:
+    """What a person reads first, from ``evaluation.json``.
+
+    Args:
+        evaluation: The content of ``evaluation.json``.
+        folder: The session's folder, for the commands to type next.
+        written: Names of the files in the session worth opening, first one first.
+    """
+    lines = [
+        *_verdict(evaluation),
+        "",
+        *_result(evaluation["result"]),
+        "",
+        _origin(evaluation["track"]["predicted_parts_mm"]),
+    ]
+    if written:
+        lines += ["", "WROTE"]
+        for number, name in enumerate(written):
+            lines.append(f"  {folder / name}" + ("   start here" if not number else ""))
+    lines += ["", f"NEXT  handeye-tri replay {folder}"]
+    return "\n".join(lines)
+
+
+def _verdict(evaluation: Mapping[str, Any]) -> list[str]:
+    track = evaluation["track"]
+    gates = evaluation["gates"]
+    ran = [gate for gate in gates if gate["verdict"] != "not run"]
+    met = [gate for gate in ran if gate["verdict"] != "bad"]
+    source = "SIMULATED" if evaluation["simulated"] else "REAL"
+    lines = [
+        f"VERDICT  {evaluation['verdict']}      {source}, {len(met)} of {len(ran)} "
+        f"gates met, {len(gates) - len(ran)} not run",
+        f"  {evaluation['sentence']}",
+        f"  Track test, {track['stations']} held-out stations: "
+        f"{track['mean_mm']:.3f} mm mean, {track['rms_mm']:.3f} rms "
+        f"({track['predicted_rms_mm']:.3f} predicted),",
+        f"  {track['max_mm']:.3f} worst (station {track['worst_station']}, "
+        f"marker {track['worst_marker']}).",
+        f"  Nearest to failing: {evaluation['nearest']}.",
+        f"  {'gate':<29}{'found':<16}{'limit':<17}{'verdict':<10}blind to",
+    ]
+    for number, gate in enumerate(gates, 1):
+        lines.append(
+            f"  {number} {gate['name']:<27}{gate['found']:<16}{gate['limit']:<17}"
+            f"{gate['verdict']:<10}{gate['blind_to']}"
+        )
+    for finding in evaluation["findings"]:
+        lines += [
+            f"  {finding['code']}: {finding['cause']}; {finding['evidence']}",
+            f"    Do: {finding['remedy']}.",
+        ]
+    return [line[:_WIDTH] if line.lstrip()[:1].isdigit() else line for line in lines]
+
+
+def _result(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    known = any(row["error"] is not None for row in rows)
+    lines = [
+        f"{'RESULT':<34}{'value':>12}{'+- (1 sd)':>14}"
+        + (f"{'truth - value':>16}" if known else "")
+    ]
+    for row in rows:
+        places = digits(row["sigma"])
+        line = (
+            f"  {row['name'] + ', ' + row['unit'] if row['unit'] else row['name']:<32}"
+            f"{row['value']:>12.{places}f}{row['sigma']:>14.{places}f}"
+        )
+        if row["error"] is not None:
+            line += f"{-row['error']:>+16.{places}f}"
+        lines.append(line)
+    return lines
+
+
+def _origin(parts: Mapping[str, float]) -> str:
+    total = sum(value**2 for value in parts.values())
+    shares = sorted(parts.items(), key=lambda item: -item[1])
+    text = "  ".join(
+        f"{name.replace('_', ' ')} {100 * value**2 / total:.0f} % ({value:.3f} mm)"
+        for name, value in shares
+    )
+    return f"WHERE THE PREDICTED TRACK ERROR COMES FROM (share of its square)\n  {text}"
+
+
+def result_rows(
+    calibration: HandEyeCalibration, truth: GroundTruth | None
+) -> list[dict[str, Any]]:
+    """Everything estimated, in units for people, each with its standard deviation.
+
+    Translations are along the axes of the frame named first, rotations are rotation
+    vectors; unlike the covariance's tangents, both can be compared by subtraction.
+
+    Args:
+        calibration: The calibrated cell.
+        truth: Where known, ``error`` is estimate less truth in the row's unit.
+
+    Returns:
+        Rows with name, unit, value, sigma, and error (None without truth).
+    """
+    rows: list[dict[str, Any]] = []
+    covariance = calibration.covariance
+    for i, camera in enumerate(calibration.cameras):
+        true_camera = truth.cameras[i] if truth else None
+        for label in covariance.labels:
+            owner, quantity = label.rsplit(".", 1)
+            if owner != camera.name:
+                continue
+            value = _parameter(camera, quantity)
+            unit = "px" if quantity in INTRINSIC_NAMES else ""
+            error = value - _parameter(true_camera, quantity) if true_camera else None
+            rows.append(_row(label, unit, value, covariance.std(label), error))
+    motions = [
+        (
+            f"base_from_{camera.name}",
+            motion,
+            truth.base_from_camera[i] if truth else None,
+        )
+        for i, (camera, motion) in enumerate(
+            zip(calibration.cameras, calibration.base_from_camera, strict=True)
+        )
+    ]
+    true_rig = truth.flange_from_triangle if truth else None
+    motions.append(("flange_from_triangle", calibration.flange_from_triangle, true_rig))
+    for name, motion, true_motion in motions:
+        block = covariance.block(motion_labels(name))
+        rows += _motion_rows(name, motion, block, true_motion)
+    return rows
+
+
+def _row(
+    name: str, unit: str, value: float, sigma: float, error: float | None
+) -> dict[str, Any]:
+    return {
+        "name": name,
+        "unit": unit,
+        "value": float(value),
+        "sigma": float(sigma),
+        "error": None if error is None else float(error),
+    }
+
+
+def _parameter(camera: PinholeCamera, quantity: str) -> float:
+    """A camera's parameter by name; a coefficient that its lens lacks is zero."""
+    if quantity in INTRINSIC_NAMES:
+        return float(getattr(camera.intrinsics, quantity))
+    names = camera.lens.names
+    if quantity not in names:
+        return 0.0
+    return float(camera.lens.coefficients[names.index(quantity)])
+
+
+def _motion_rows(
+    name: str, motion: SE3, covariance: Floats, truth: SE3 | None
+) -> list[dict[str, Any]]:
+    """Six rows of a motion whose right tangent has this covariance, (6, 6)."""
+    vector = so3_log(motion.rotation)
+    # A right tangent moves t by R dt, and the rotation vector by J_l(-w)^-1 dw.
+    by_tangent = np.zeros((6, 6))
+    by_tangent[:3, :3] = motion.rotation
+    by_tangent[3:, 3:] = so3_left_jacobian_inverse(-vector)
+    sigma = np.sqrt(np.diagonal(by_tangent @ covariance @ by_tangent.T))
+    value = np.concatenate([motion.translation, vector])
+    error = None
+    if truth is not None:
+        # A difference of rotation vectors taken along the short way around.
+        turned = so3_log(truth.rotation.T @ motion.rotation)
+        error = np.concatenate(
+            [motion.translation - truth.translation, by_tangent[3:, 3:] @ turned]
+        )
+    rows = []
+    for k, quantity in enumerate(("x", "y", "z", "rx", "ry", "rz")):
+        scale, unit = (1e3, "mm") if k < 3 else (180 / np.pi, "deg")
+        rows.append(
+            _row(
+                f"{name}.{quantity}",
+                unit,
+                scale * value[k],
+                scale * sigma[k],
+                None if error is None else scale * error[k],
+            )
+        )
+    return rows
