@@ -50,7 +50,7 @@ _ROBOT_STREAM, _SENSOR_STREAM = 101, 102
 # Solid and drawn.
 _SOLID = {"contype": 1, "conaffinity": 1, "group": 0}
 _CELL = "cell"
-_GREYS = {"rod": 0.30, "surroundings": 0.38, "housing": 0.16}
+_GREYS = {"rod": 0.25, "surroundings": 0.48, "housing": 0.16}
 # Optical frames look along z with y down, MuJoCo's along -z with y up.
 _OPTICAL_FROM_MUJOCO = np.diag([1.0, -1.0, -1.0])
 
@@ -147,8 +147,8 @@ def _set_scene(mujoco: Any, spec: Any) -> None:
     spec.visual.quality.offsamples = 0
     spec.visual.quality.numslices = 32
     spec.visual.quality.numstacks = 24
-    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
-    spec.visual.headlight.diffuse = [0.30, 0.30, 0.30]
+    spec.visual.headlight.ambient = [0.40, 0.40, 0.40]
+    spec.visual.headlight.diffuse = [0.35, 0.35, 0.35]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
     spec.worldbody.add_light(
         name=f"{_CELL}/light",
@@ -156,7 +156,7 @@ def _set_scene(mujoco: Any, spec: Any) -> None:
         pos=[1.0, 1.0, 3.0],
         dir=[-0.4, -0.45, -0.8],
         ambient=[0.0, 0.0, 0.0],
-        diffuse=[0.55, 0.55, 0.55],
+        diffuse=[0.45, 0.45, 0.45],
         specular=[0.2, 0.2, 0.2],
         castshadow=False,
     )
@@ -164,8 +164,8 @@ def _set_scene(mujoco: Any, spec: Any) -> None:
         name=f"{_CELL}/sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.62, 0.62, 0.62],
-        rgb2=[0.30, 0.30, 0.30],
+        rgb1=[0.68, 0.68, 0.68],
+        rgb2=[0.46, 0.46, 0.46],
         width=128,
         height=768,
     )
