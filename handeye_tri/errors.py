@@ -34,6 +34,10 @@ class NoPlanError(HandEyeError):
         super().__init__(message)
         self.rejected = dict(rejected)
 
+    def __reduce__(self) -> tuple[type[NoPlanError], tuple[str, dict[str, int]]]:
+        # Exceptions pickle by their args alone; workers send both parts home.
+        return type(self), (str(self), self.rejected)
+
 
 class MissingDependencyError(HandEyeError, ImportError):
     """A system library or an optional package is absent; says how to get it."""

@@ -13,11 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.errors import InputError
+from handeye_tri.records import locked
 from handeye_tri.se3 import SE3
 
 Floats = NDArray[np.float64]
 JointKind = Literal["hinge", "slide"]
 Shape = Literal["box", "sphere", "capsule", "cylinder", "ellipsoid", "plane", "mesh"]
+# How many numbers say the size of each shape.
+_SIZES = {
+    "box": 3,
+    "sphere": 1,
+    "capsule": 2,
+    "cylinder": 2,
+    "ellipsoid": 3,
+    "plane": 0,
+    "mesh": 0,
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +56,22 @@ class Joint:
     upper: float
     reference: float
     speed: float
+
+    def __post_init__(self) -> None:
+        """Lock; raise InputError where the axis or the limits are impossible."""
+        for key in ("anchor", "axis"):
+            name = f"joint {self.name!r}: {key}"
+            object.__setattr__(self, key, locked(name, getattr(self, key), (3,)))
+        if abs(np.linalg.norm(self.axis) - 1) > 1e-9:
+            raise InputError(
+                f"joint {self.name!r}: the axis must have length 1, "
+                f"got {self.axis.tolist()}"
+            )
+        if not self.lower <= self.upper:
+            raise InputError(
+                f"joint {self.name!r}: the lower limit {self.lower:g} exceeds the "
+                f"upper limit {self.upper:g}"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +116,25 @@ class Geometry:
     rgba: Floats
     collides: bool
 
+    def __post_init__(self) -> None:
+        """Lock; raise InputError where a shape or a mesh index does not fit."""
+        label = f"geometry {self.name!r}"
+        for key, shape in (
+            ("size", (_SIZES[self.shape],)),
+            ("vertices", (None, 3)),
+            ("rgba", (4,)),
+        ):
+            array = locked(f"{label}: {key}", getattr(self, key), shape)
+            object.__setattr__(self, key, array)
+        faces = np.array(self.faces, dtype=np.int64).reshape(-1, 3)
+        if faces.size and not 0 <= faces.min() <= faces.max() < len(self.vertices):
+            raise InputError(
+                f"{label}: a face names a vertex beyond the {len(self.vertices)} "
+                "there are"
+            )
+        faces.setflags(write=False)
+        object.__setattr__(self, "faces", faces)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mechanism:
@@ -119,6 +165,21 @@ class Mechanism:
     marker_body: int
     markers: Floats
     touching: frozenset[tuple[int, int]]
+
+    def __post_init__(self) -> None:
+        """Lock; raise InputError unless the bodies are a tree in parents' order."""
+        object.__setattr__(self, "markers", locked("markers", self.markers, (3, 3)))
+        n = len(self.bodies)
+        for index, body in enumerate(self.bodies):
+            if not 0 <= body.parent < max(index, 1):
+                raise InputError(
+                    f"body {body.name!r} comes before its parent; list parents first"
+                )
+        used = [self.base_body, self.flange_body, self.marker_body]
+        used += [joint.body for joint in self.joints]
+        used += [geometry.body for geometry in self.geometries]
+        if not all(0 <= body < n for body in used):
+            raise InputError(f"a body index lies beyond the {n} bodies there are")
 
     def chain(self, body: int) -> tuple[int, ...]:
         """Bodies from the world's child down to ``body``, in that order."""

@@ -61,14 +61,24 @@ class TriangleRig:
 
     @classmethod
     def from_points(cls, points: ArrayLike) -> TriangleRig:
-        """Triangle through measured A, B, C, shape (3, 3) or (3, 2), metres."""
-        a, b, c = np.asarray(points, dtype=float)
-        ab, ac = b - a, c - a
+        """Triangle through measured A, B, C, shape (3, 3) or (3, 2), metres.
+
+        Raises:
+            InputError: wrong shape, NaN, or the points are nearly collinear.
+        """
+        p = np.asarray(points, dtype=float)
+        if p.shape not in ((3, 3), (3, 2)):
+            raise InputError(
+                f"A, B and C are points of shape (3, 3) or (3, 2), got {p.shape}"
+            )
+        ab, ac = p[1] - p[0], p[2] - p[0]
         lengths = float(np.linalg.norm(ab)), float(np.linalg.norm(ac))
-        if min(lengths) == 0:
+        if min(lengths) == 0 or not np.any(p[1] - p[2]):
             raise InputError("two of A, B and C coincide; give three distinct points")
-        cosine = np.clip(ab @ ac / (lengths[0] * lengths[1]), -1, 1)
-        return cls(*lengths, float(np.arccos(cosine)))
+        # Half-angle form (Kahan): keeps its digits at every angle.
+        u, v = ab / lengths[0], ac / lengths[1]
+        angle = 2 * np.arctan2(np.linalg.norm(u - v), np.linalg.norm(u + v))
+        return cls(*lengths, float(angle))
 
     @property
     def points(self) -> Floats:

@@ -1,0 +1,48 @@
+"""What flows between stages: frozen records whose arrays are copied and locked.
+
+Indices: i counts the m cameras, j the n stations, k the markers A, B, C.
+Metres, radians and pixels inside; files and people get mm and degrees by name.
+"""
+
+from handeye_tri.records.arrays import Floats, locked
+    locked,
+)
+from handeye_tri.records.covariance import (
+    MOTION_QUANTITIES,
+    Covariance,
+    motion_labels,
+)
+from handeye_tri.records.results import (
+    CameraCalibration,
+    GroundTruth,
+    HandEyeCalibration,
+    TrackEvaluation,
+)
+from handeye_tri.records.session import (
+    CameraInfo,
+    HalfTurn,
+    Plan,
+    Repeatability,
+    Session,
+    Station,
+    StationKind,
+)
+
+__all__ = [
+    "Floats",
+    "locked",
+    "MOTION_QUANTITIES",
+    "Covariance",
+    "motion_labels",
+    "CameraCalibration",
+    "GroundTruth",
+    "HandEyeCalibration",
+    "TrackEvaluation",
+    "CameraInfo",
+    "HalfTurn",
+    "Plan",
+    "Repeatability",
+    "Session",
+    "Station",
+    "StationKind",
+]

@@ -1,0 +1,218 @@
+"""What is planned and measured: stations, half-turns, detected markers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.camera import LENS_COEFFICIENTS
+from handeye_tri.errors import InputError
+from handeye_tri.records.arrays import Floats, locked
+from handeye_tri.se3 import SE3
+from handeye_tri.triangle import AXES, VERTICES, Axis, TriangleRig
+
+StationKind = Literal["calibration", "evaluation"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Station:
+    """Where the robot stops.
+
+    Attributes:
+        index: Position in the programme, from 0.
+        kind: "calibration" stations are used, "evaluation" stations held out.
+        joints: Shape (q,), rad or m; empty where the robot reports poses only.
+        base_from_flange: The pose that the robot reports (in a plan: commands).
+    """
+
+    index: int
+    kind: StationKind
+    joints: Floats
+    base_from_flange: SE3
+
+    def __post_init__(self) -> None:
+        """Lock the joints; raise InputError where the kind is none."""
+        object.__setattr__(self, "joints", locked("joints", self.joints, (None,)))
+        if self.kind not in get_args(StationKind):
+            raise InputError(
+                f"station {self.index}: kind must be one of "
+                f"{', '.join(get_args(StationKind))}, got {self.kind!r}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class HalfTurn:
+    """Two stations that differ by 180 degrees about an axis of the triangle.
+
+    Attributes:
+        before: Index of the station before the turn.
+        after: Index of the station after it.
+        axis: "normal", "AB", "BC" or "CA".
+    """
+
+    before: int
+    after: int
+    axis: Axis
+
+    def __post_init__(self) -> None:
+        """Raise InputError where the axis is none or nothing turns."""
+        if self.axis not in AXES:
+            raise InputError(
+                f"a half-turn's axis must be one of {', '.join(AXES)}, "
+                f"got {self.axis!r}"
+            )
+        if self.before == self.after:
+            raise InputError(
+                f"a half-turn needs two stations, got {self.before} for both"
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """A robot programme.
+
+    Attributes:
+        stations: In the order of execution.
+        half_turns: Which stations belong together.
+        rejected: Rejected candidates by the check that rejected them.
+        certificate: Numbers that the plan promises, by name; unit in the name.
+        seed: What the plan was drawn from.
+    """
+
+    stations: tuple[Station, ...]
+    half_turns: tuple[HalfTurn, ...]
+    rejected: Mapping[str, int]
+    certificate: Mapping[str, float]
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """What is known of a camera before calibration, and what is to be estimated.
+
+    Attributes:
+        name: What the camera is called.
+        image_size: (width, height), pixels.
+        skew: Whether the skew factor is estimated (else it is zero).
+        lens: Names of the lens coefficients to estimate; empty for a pinhole.
+        lens_model: "radtan" or "rational"; the meaning of those names.
+    """
+
+    name: str
+    image_size: tuple[int, int]
+    skew: bool = True
+    lens: tuple[str, ...] = ()
+    lens_model: Literal["radtan", "rational"] = "radtan"
+
+    def __post_init__(self) -> None:
+        """Raise InputError where the lens model or a coefficient is not known."""
+        known = LENS_COEFFICIENTS.get(self.lens_model, ())
+        if not known or not set(self.lens) <= set(known):
+            raise InputError(
+                f"camera {self.name!r}: lens {list(self.lens)} must name coefficients "
+                f"of a {' or '.join(LENS_COEFFICIENTS)} lens, got model "
+                f"{self.lens_model!r}"
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Repeatability:
+    """One standard deviation of the robot's pose error, per axis.
+
+    Attributes:
+        translation: Metres.
+        rotation: Radians.
+    """
+
+    translation: float
+    rotation: float
+
+    def __post_init__(self) -> None:
+        """Raise InputError where a deviation is negative or not finite."""
+        for name in ("translation", "rotation"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise InputError(
+                    f"repeatability: {name} must be 0 or more, got {value}"
+                )
+
+    @property
+    def covariance(self) -> Floats:
+        """Covariance of the tangent (translation, rotation), shape (6, 6)."""
+        return np.diag([self.translation**2] * 3 + [self.rotation**2] * 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """All that the estimators get to know, whatever its source.
+
+    Attributes:
+        triangle: The three-point rig.
+        marker_radii: Shape (3,), metres; zero for flat dots.
+        cameras: What is known of the m cameras.
+        stations: The n stations, with the poses that the robot reported.
+        half_turns: Pairs of calibration stations.
+        pixels: Shape (m, n, 3, 2); centres of A, B, C as detected; NaN = unseen.
+        pixel_covariance: Shape (m, n, 3, 2, 2), px^2; NaN where unseen.
+        repeatability: The robot's stated repeatability.
+        simulated: Whether a ground truth exists somewhere.
+    """
+
+    triangle: TriangleRig
+    marker_radii: Floats
+    cameras: tuple[CameraInfo, ...]
+    stations: tuple[Station, ...]
+    half_turns: tuple[HalfTurn, ...]
+    pixels: Floats
+    pixel_covariance: Floats
+    repeatability: Repeatability
+    simulated: bool
+
+    def __post_init__(self) -> None:
+        """Lock; raise InputError where shapes or indices do not fit together."""
+        m, n = len(self.cameras), len(self.stations)
+        for name, value, shape, finite in (
+            ("marker_radii", self.marker_radii, (3,), True),
+            ("pixels", self.pixels, (m, n, 3, 2), False),
+            ("pixel_covariance", self.pixel_covariance, (m, n, 3, 2, 2), False),
+        ):
+            object.__setattr__(self, name, locked(name, value, shape, finite=finite))
+        names = [camera.name for camera in self.cameras]
+        if len(set(names)) < m:
+            raise InputError(f"camera names must differ, got {', '.join(names)}")
+        for j, station in enumerate(self.stations):
+            if station.index != j:
+                raise InputError(
+                    f"station {j} in the session has index {station.index}"
+                )
+        for turn in self.half_turns:
+            if not (0 <= turn.before < n and 0 <= turn.after < n):
+                raise InputError(f"{turn} names a station beyond the {n} there are")
+            for j in (turn.before, turn.after):
+                if self.stations[j].kind != "calibration":
+                    raise InputError(
+                        f"{turn} uses station {j}, which is held out for evaluation"
+                    )
+        seen = np.isfinite(self.pixels).all(axis=-1)
+        weighed = np.isfinite(self.pixel_covariance).all(axis=(-2, -1))
+        if (seen & ~weighed).any():
+            i, j, k = np.argwhere(seen & ~weighed)[0]
+            raise InputError(
+                f"camera {names[i]!r}, station {j}, marker {VERTICES[k]}: a detected "
+                "pixel needs a finite covariance"
+            )
+
+    @property
+    def base_from_flange(self) -> Floats:
+        """Robot-reported poses, shape (n, 4, 4), metres."""
+        return np.array([s.base_from_flange.matrix for s in self.stations])
+
+    def indices(self, kind: StationKind) -> NDArray[np.intp]:
+        """Indices of the stations of one kind, ascending."""
+        return np.array(
+            [s.index for s in self.stations if s.kind == kind], dtype=np.intp
+        )
