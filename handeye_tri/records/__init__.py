@@ -5,8 +5,6 @@ Metres, radians and pixels inside; files and people get mm and degrees by name.
 """
 
 from handeye_tri.records.arrays import Floats, locked
-    locked,
-)
 from handeye_tri.records.covariance import (
     MOTION_QUANTITIES,
     Covariance,
