@@ -1,0 +1,191 @@
+"""Candidates for stations: poses that pass every check, one by one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.arm import Arm
+from handeye_tri.plan.poses import HALF_TURN, View
+
+Floats = NDArray[np.float64]
+
+# Poses drawn at once, and at most, until enough pass.
+_BATCH = 120
+_MOST_POSES = 3600
+# A cell in which none of this many poses passes has no plan.
+_HOPELESS = 1800
+# Inverse solutions of a pose that are tried, nearest to those before first.
+_SOLUTIONS = 4
+_STARTS = 12
+# The sphere to see whole is larger than the marker by this factor: blur and the
+# detector's window reach beyond the outline.
+SIGHT_MARGIN = 1.15
+_BY_RIG = "occlusion by the rig"
+# Two flange poses are one if they differ by less (m and rad).
+_SAME_POSE = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A place for one station, or for the two of a half-turn.
+
+    Attributes:
+        joints: Shape (s, q), rad or m: s = 2 before and after a half-turn, else 1.
+        base_from_flange: Shape (s, 4, 4), metres.
+        normal: Unit normal of the triangle in the world, shape (3,).
+    """
+
+    joints: Floats
+    base_from_flange: Floats
+    normal: Floats
+
+
+class CandidateSearch:
+    """Draws poses and keeps those that pass; counts the others by check.
+
+    Attributes:
+        rejected: Rejected poses by the check that rejected them.
+        drawn: Poses drawn.
+    """
+
+    def __init__(self, view: View, arm: Arm, rng: np.random.Generator) -> None:
+        """Start a search.
+
+        Args:
+            view: Cameras and rig.
+            arm: The robot in its cell.
+            rng: What poses are drawn from.
+        """
+        self._view = view
+        self._arm = arm
+        self._rng = rng
+        self._anchor = arm.home
+        self.rejected: Counter[str] = Counter()
+        self.drawn = 0
+
+    def find(
+        self, wanted: int, *, turns: bool, progress: Callable[[int], None] | None = None
+    ) -> list[Candidate]:
+        """Search until enough candidates are found or hope is lost.
+
+        Args:
+            wanted: How many.
+            turns: Whether a candidate is a half-turn (else one station).
+            progress: Told how many there are, after each one.
+
+        Returns:
+            Up to ``wanted`` candidates, in the order drawn.
+        """
+        found: list[Candidate] = []
+        while len(found) < wanted and self.drawn < _MOST_POSES:
+            if not found and self.drawn >= _HOPELESS:
+                break
+            for before, after in self._solved(turns):
+                candidate = self._first_free(before, after)
+                if candidate is None:
+                    continue
+                self._anchor = candidate.joints[-1]
+                found.append(candidate)
+                if progress is not None:
+                    progress(len(found))
+                if len(found) == wanted:
+                    break
+        return found
+
+    def _solved(self, turns: bool) -> list[tuple[Floats, list[Floats]]]:
+        """Joints of a batch of poses that pass the checks without solids.
+
+        Returns:
+            Per pose its solutions (s, q), and for each of them those after the
+            half-turn, shape (t, q); without turns t = 0.
+        """
+        view, arm = self._view, self._arm
+        poses = view.draw(self._rng, _BATCH)
+        self.drawn += len(poses)
+        for name, check in (("tilt", view.tilt_allowed), ("image", view.in_image)):
+            passed = check(poses)
+            if turns:
+                passed &= check(poses @ HALF_TURN)
+            self.rejected[name] += int((~passed).sum())
+            poses = poses[passed]
+        if len(poses) == 0:
+            return []
+        targets = arm.base_from_world.matrix @ poses
+        before = arm.inverse(targets, self._rng, starts=_STARTS)
+        solved = []
+        for joints, beyond in zip(before.joints, before.beyond_limits, strict=True):
+            if len(joints) == 0:
+                self.rejected["limits" if beyond else "reach"] += 1
+            else:
+                solved.append((joints, self._turned(joints) if turns else []))
+        if not turns:
+            return solved
+        possible = [s for s in solved if any(len(after) for after in s[1])]
+        self.rejected["half_turn"] += len(solved) - len(possible)
+        return possible
+
+    def _turned(self, joints: Floats) -> list[Floats]:
+        """Joints after the half-turn, for each solution (s, q) before it.
+
+        The last joint turns where its axis is the flange's; otherwise inverse
+        kinematics, and the solution nearest to the one before.
+        """
+        arm = self._arm
+        target = arm.forward(joints) @ HALF_TURN
+        tries = np.repeat(joints[:, None], 2, axis=1)
+        tries[..., -1] += (-np.pi, np.pi)
+        off = np.abs(arm.forward(tries) - target[:, None]).max(axis=(-1, -2))
+        exact = off < _SAME_POSE
+        inside = ((tries >= arm.lower) & (tries <= arm.upper)).all(axis=-1)
+        if exact.any():
+            return [
+                turned[keep][np.argsort(np.abs(turned[keep][:, -1]), kind="stable")]
+                for turned, keep in zip(tries, exact & inside, strict=True)
+            ]
+        others = arm.inverse(target[0], self._rng, starts=_STARTS).joints[0]
+        return [
+            others[np.argsort(np.linalg.norm(others - q, axis=1))[:1]] for q in joints
+        ]
+
+    def _first_free(self, before: Floats, after: list[Floats]) -> Candidate | None:
+        """The first solution that no solid forbids; else count what forbade it."""
+        order = np.argsort(np.linalg.norm(before - self._anchor, axis=1))
+        reasons: list[str] = []
+        for k in order[:_SOLUTIONS]:
+            ends = after[k] if after else before[k : k + 1]
+            for end in ends:
+                joints = np.stack([before[k], end]) if after else end[None]
+                reason = self._obstacle(joints)
+                if reason is None:
+                    poses = self._arm.forward(joints)
+                    world = self._arm.base_from_world.inverse().matrix @ poses[:1]
+                    return Candidate(joints, poses, self._view.normals(world)[0])
+                reasons.append(reason)
+                if reason == _BY_RIG:
+                    # The rig hides its own marker: so it does in every solution.
+                    self.rejected["occlusion"] += 1
+                    return None
+        # The solution that came farthest speaks for the pose.
+        checks = ("half_turn", "occlusion", "collision", "turn_path")
+        self.rejected[max(reasons, key=checks.index, default="half_turn")] += 1
+        return None
+
+    def _obstacle(self, joints: Floats) -> str | None:
+        """Name of the check that a candidate's joints (s, q) fail, or None."""
+        arm, view = self._arm, self._view
+        for q in joints:
+            for camera in view.world_from_camera[:, :3, 3]:
+                for marker, radius in enumerate(SIGHT_MARGIN * view.radii):
+                    blocker = arm.sight_blocked(q, camera, marker, radius)
+                    if blocker is not None:
+                        return _BY_RIG if blocker in arm.on_flange else "occlusion"
+        if any(arm.collision(q) is not None for q in joints):
+            return "collision"
+        if len(joints) == 2 and arm.path_collision(*joints) is not None:
+            return "turn_path"
+        return None

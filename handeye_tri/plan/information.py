@@ -1,0 +1,215 @@
+"""What stations tell about the cell: Fisher information, before any image exists.
+
+Model: every camera's intrinsics and lens, every camera in the base, and the rig on
+the flange are unknown; each station's pose differs from the reported one by the
+robot's repeatability, which is eliminated station by station. The information of
+stations adds up, and the inverse of its sum is the Cramer-Rao bound of an
+adjustment that uses the pixels of all stations together.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.camera import INTRINSIC_NAMES
+from handeye_tri.plan.poses import View
+from handeye_tri.records import Covariance, Repeatability, motion_labels
+from handeye_tri.se3 import hat, se3_inverse
+
+Floats = NDArray[np.float64]
+
+# Prior standard deviations that keep a few stations solvable; far wider than what
+# two half-turns give: pixels for intrinsics, bare numbers for the lens, m and rad.
+_PRIOR_PIXELS = 1000.0
+_PRIOR_LENS = 1.0
+_PRIOR_MOTION = 1.0
+
+
+class StationInformation:
+    """Predicts covariances of a calibration from flange poses.
+
+    Attributes:
+        labels: Names of the p unknowns, as in a calibration's covariance.
+        sigma_px: Standard deviation of a detected centre per axis, pixels.
+    """
+
+    def __init__(
+        self,
+        view: View,
+        base_from_world: Floats,
+        repeatability: Repeatability,
+        sigma_px: float,
+    ) -> None:
+        """Set up the unknowns.
+
+        Args:
+            view: Cameras and rig.
+            base_from_world: Shape (4, 4), metres.
+            repeatability: The robot's pose error.
+            sigma_px: Of a detected centre, per axis, pixels.
+        """
+        self._view = view
+        self._camera_from_base = se3_inverse(base_from_world @ view.world_from_camera)
+        self._pose_covariance = repeatability.covariance
+        self.sigma_px = sigma_px
+        labels: list[str] = []
+        self._columns: list[tuple[slice, list[int], list[int]]] = []
+        prior: list[float] = []
+        for config in view.cell.cameras:
+            chosen = [
+                k
+                for k, name in enumerate(INTRINSIC_NAMES)
+                if name != "skew" or config.estimate.skew
+            ]
+            lens_names = config.camera.lens.names
+            lens = [
+                k for k, name in enumerate(lens_names) if name in config.estimate.lens
+            ]
+            begin = len(labels)
+            labels += [f"{config.name}.{INTRINSIC_NAMES[k]}" for k in chosen]
+            labels += [f"{config.name}.{lens_names[k]}" for k in lens]
+            labels += motion_labels(f"base_from_{config.name}")
+            self._columns.append((slice(begin, len(labels)), chosen, lens))
+            prior += [_PRIOR_PIXELS] * len(chosen) + [_PRIOR_LENS] * len(lens)
+            prior += [_PRIOR_MOTION] * 6
+        labels += motion_labels("flange_from_triangle")
+        prior += [_PRIOR_MOTION] * 6
+        self.labels = tuple(labels)
+        self.prior = np.diag(1.0 / np.square(prior))
+
+    def _derivatives(self, base_from_flange: Floats) -> tuple[Floats, Floats, Floats]:
+        """Pixels by unknowns, by the station's error, and by the points in base.
+
+        Args:
+            base_from_flange: Shape (n, 4, 4), metres.
+
+        Returns:
+            Shapes (n, m, 3, 2, p), (n, m, 3, 2, 6), (n, m, 3, 2, 3).
+        """
+        view = self._view
+        n, m, p = len(base_from_flange), len(view.cameras), len(self.labels)
+        by_unknowns = np.zeros((n, m, 3, 2, p))
+        by_error = np.zeros((n, m, 3, 2, 6))
+        by_base_point = np.zeros((n, m, 3, 2, 3))
+        triangle = view.cell.rig.triangle.points
+        for i, camera in enumerate(view.cameras):
+            camera_from_flange = self._camera_from_base[i] @ base_from_flange
+            rotation = camera_from_flange[:, None, :3, :3]
+            points = (rotation @ view.markers[..., None])[..., 0]
+            points += camera_from_flange[:, None, :3, 3]
+            _, by_point, by_intrinsics, by_lens = camera.project_jacobians(points)
+            columns, chosen, lens = self._columns[i]
+            by_camera = np.concatenate([-by_point, by_point @ hat(points)], axis=-1)
+            by_unknowns[:, i, :, :, columns] = np.concatenate(
+                [by_intrinsics[..., chosen], by_lens[..., lens], by_camera], axis=-1
+            )
+            by_flange = by_point @ rotation
+            by_error[:, i] = np.concatenate(
+                [by_flange, -by_flange @ hat(view.markers)], axis=-1
+            )
+            by_triangle = by_flange @ view.flange_from_triangle.rotation
+            by_unknowns[:, i, :, :, -6:] = np.concatenate(
+                [by_triangle, -by_triangle @ hat(triangle)], axis=-1
+            )
+            by_base_point[:, i] = by_point @ self._camera_from_base[i, :3, :3]
+        return by_unknowns, by_error, by_base_point
+
+    def of_stations(self, base_from_flange: Floats) -> Floats:
+        """Information of each station, shape (n, p, p), of poses (n, 4, 4)."""
+        by_unknowns, by_error, _ = self._derivatives(base_from_flange)
+        n, p = len(base_from_flange), len(self.labels)
+        a = by_unknowns.reshape(n, -1, p)
+        b = by_error.reshape(n, -1, 6)
+        noise = b @ self._pose_covariance @ b.swapaxes(-1, -2)
+        noise += self.sigma_px**2 * np.eye(a.shape[1])
+        return np.asarray(a.swapaxes(-1, -2) @ np.linalg.solve(noise, a))
+
+    def track_derivatives(self, base_from_flange: Floats) -> Floats:
+        """Observed less reported marker positions by the unknowns.
+
+        Observed: triangulated from fixed pixels with equal weights. Reported: the
+        robot's pose applied to the markers on the flange.
+
+        Args:
+            base_from_flange: Shape (n, 4, 4), metres.
+
+        Returns:
+            Shape (n, 3, 3, p): station, marker, axis in base.
+        """
+        by_unknowns, _, by_point = self._derivatives(base_from_flange)
+        triangle = self._view.cell.rig.triangle.points
+        # The triangle's own columns do not move what the cameras observe.
+        by_cameras = by_unknowns.copy()
+        by_cameras[..., -6:] = 0.0
+        normal = np.einsum("nikac,nikad->nkcd", by_point, by_point)
+        pull = np.einsum("nikac,nikap->nkcp", by_point, by_cameras)
+        result = -np.linalg.solve(normal, pull)
+        rotation = base_from_flange[:, None, :3, :3]
+        rotation = rotation @ self._view.flange_from_triangle.rotation
+        result[..., -6:-3] -= rotation
+        result[..., -3:] += rotation @ hat(triangle)
+        return np.asarray(result)
+
+    def covariance(self, information: Floats) -> Covariance:
+        """Predicted covariance of the unknowns from summed information, (p, p)."""
+        return Covariance(self.labels, _inverse(information + self.prior))
+
+
+def _inverse(information: Floats) -> Floats:
+    """Inverses of symmetric matrices (..., p, p), scaled to unit diagonal first."""
+    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
+    scale = 1.0 / np.sqrt(diagonal)
+    scaled = information * scale[..., :, None] * scale[..., None, :]
+    inverse = np.linalg.inv(scaled) * scale[..., :, None] * scale[..., None, :]
+    return np.asarray(0.5 * (inverse + inverse.swapaxes(-1, -2)))
+
+
+def choose(
+    information: Floats,
+    prior: Floats,
+    cost: Floats,
+    wanted: int,
+    exchanges: int = 3,
+) -> list[int]:
+    """The candidates that make ``trace(cost @ covariance)`` small.
+
+    Greedy, then Fedorov's exchange: replace one chosen candidate at a time as long
+    as that helps (Fedorov 1972, Theory of Optimal Experiments, ch. 3).
+
+    Args:
+        information: Of every candidate, shape (n, p, p).
+        prior: What is known before, shape (p, p).
+        cost: What a covariance costs, shape (p, p).
+        wanted: How many to choose, at most n.
+        exchanges: Upper limit of rounds.
+
+    Returns:
+        Indices, ascending.
+    """
+
+    def costs(total: Floats) -> Floats:
+        return np.asarray(np.einsum("ab,nba->n", cost, _inverse(total + information)))
+
+    chosen: list[int] = []
+    total = prior.copy()
+    for _ in range(wanted):
+        values = costs(total)
+        values[chosen] = np.inf
+        best = int(np.argmin(values))
+        chosen.append(best)
+        total = total + information[best]
+    for _ in range(exchanges):
+        changed = False
+        for place, current in enumerate(chosen):
+            without = total - information[current]
+            values = costs(without)
+            values[[c for c in chosen if c != current]] = np.inf
+            best = int(np.argmin(values))
+            if values[best] < values[current] * (1 - 1e-6):
+                chosen[place] = best
+                total = without + information[best]
+                changed = True
+        if not changed:
+            break
+    return sorted(chosen)
