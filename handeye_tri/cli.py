@@ -60,7 +60,9 @@ class _StderrProgress:
     def end(self, line: str, seconds: float | None) -> None:
         self.close()
         took = "up to date" if seconds is None else f"{seconds:.1f} s"
-        self._console.print(f"{self._head} {line}  [{took}]", markup=False)
+        self._console.print(
+            f"{self._head} {line}  [{took}]", markup=False, soft_wrap=True
+        )
 
     def close(self) -> None:
         """Take the bar off the screen."""

@@ -141,6 +141,9 @@ class SessionFolder:
             ) from None
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            for part in self.path.rglob(".*.part"):
+                # A killed process left it; nobody else writes here now.
+                part.unlink(missing_ok=True)
             yield
         except BlockingIOError:
             raise StorageError(

@@ -93,6 +93,15 @@ def test_a_start_that_fails_leaves_no_folder(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_a_killed_process_left_half_written_goes(folder):
+    part = folder.path / "images" / ".left_000.png.abc.part"
+    part.parent.mkdir()
+    part.write_bytes(b"half")
+    with folder.locked():
+        assert not part.exists()
+    assert folder.file("a.json").is_file()
+
+
 def test_two_processes_cannot_share_a_session(folder):
     code = (
         "import sys, pathlib; from handeye_tri.storage import SessionFolder\n"

@@ -1,0 +1,144 @@
+import subprocess
+import sys
+import time
+
+import pytest
+
+from handeye_tri import cli
+from handeye_tri.storage import find_cell
+
+VERBS = sorted(cli.commands.commands)
+
+
+def call(capsys, *arguments):
+    """Run the command line in this process: exit code, stdout, stderr."""
+    with pytest.raises(SystemExit) as left:
+        cli.main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return left.value.code, out, err
+
+
+def changed_cell(tmp_path, *changes):
+    text = find_cell("hp3_stereo").read_text()
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    path = tmp_path / "cell.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_fits_a_screen_and_has_an_example(capsys, verb):
+    code, out, _ = call(capsys, verb, "--help")
+    assert code == 0
+    assert len(out.splitlines()) <= 30
+    assert f"handeye-tri {verb}" in out.split("Example:")[1]
+
+
+def test_help_starts_without_heavy_modules():
+    code = (
+        "import sys; from handeye_tri import cli\n"
+        "try: cli.main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'numpy', 'scipy', 'mujoco', 'pinocchio', 'cv2', 'rerun'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, check=False
+    )
+    assert done.returncode == 0, done.stderr.decode()
+    assert b"hp3_stereo" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            [("half_turns: 11", "half_turn: 11")],
+            "plan.half_turn: this key is not known",
+        ),
+        ([("side_ab_mm: 130", "side_ab_m: 0.13")], "rig.side_ab_m: this key is not"),
+        ([("angle_deg: 65", "angle_deg: 0.1")], "nearly collinear"),
+        ([("flange: flange", "flange: nose")], "nose"),
+        ([("model: hp3_like.xml", "model: absent.xml")], "arm.model: no file"),
+    ],
+)
+def test_a_bad_cell_is_one_sentence_and_writes_nothing(
+    capsys, tmp_path, changes, message
+):
+    cell = changed_cell(tmp_path, *changes)
+    code, out, err = call(capsys, "run", cell, "-o", tmp_path / "out")
+    assert code == 2
+    assert message in err
+    assert "Traceback" not in err
+    assert out == ""
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cell_without_a_plan_says_which_check_rejected_how_many(capsys, tmp_path):
+    cell = changed_cell(
+        tmp_path,
+        ("look_at_m: [0.45, 0.0, 0.42]", "look_at_m: [2.5, 0.0, 0.42]"),
+    )
+    started = time.monotonic()
+    code, _, err = call(capsys, "run", cell, "-o", tmp_path / "out")
+    assert time.monotonic() - started < 20
+    assert code == 2
+    assert err.count("error:") == 1
+    assert any(character.isdigit() for character in err.split("error:")[1])
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_holds_something_else_is_left_alone(capsys, tmp_path):
+    (tmp_path / "thesis.tex").write_text("precious")
+    code, _, err = call(capsys, "run", "hp3_stereo", "-o", tmp_path)
+    assert code == 2
+    assert "holds something else" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("verb", ["simulate", "detect", "calibrate", "evaluate"])
+def test_a_verb_on_no_session_says_so(capsys, tmp_path, verb):
+    code, _, err = call(capsys, verb, tmp_path / "absent")
+    assert code == 2
+    assert "there is no such session folder" in err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["run"], ["nonsense"], ["run", "hp3_stereo", "-o", "x", "--seed", "a"]],
+)
+def test_usage_errors_leave_with_2(capsys, arguments):
+    code, _, err = call(capsys, *arguments)
+    assert code == 2
+    assert "Error:" in err
+
+
+def test_a_negative_seed_is_refused(capsys, tmp_path):
+    code, _, err = call(capsys, "run", "-o", tmp_path / "out", "--seed", "-1")
+    assert code == 2
+    assert "--seed must not be negative" in err
+
+
+def test_a_bug_of_ours_leaves_with_1_and_a_log(capsys, monkeypatch):
+    def explode(*_, **__):
+        raise ZeroDivisionError("whoops")
+
+    monkeypatch.setattr(cli.commands, "main", explode)
+    code, _, err = call(capsys, "run")
+    assert code == 1
+    assert "Traceback" not in err
+    log = err.strip().rsplit(" ", 1)[1]
+    with open(log) as stream:
+        assert "ZeroDivisionError: whoops" in stream.read()
+
+
+def test_an_interrupt_leaves_with_130(capsys, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.commands, "main", interrupt)
+    code, _, err = call(capsys, "run")
+    assert code == 130
+    assert "goes on where it was" in err

@@ -1,0 +1,107 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from handeye_tri.calibrate_cameras import calibrate_session_cameras
+from handeye_tri.hand_eye import calibrate_hand_eye
+from handeye_tri.records import Repeatability
+from handeye_tri.summary import digits, result_rows, summary_text
+from handeye_tri.synthesize import reference_geometry, synthesize
+
+REPEATABILITY = Repeatability(3e-5, float(np.radians(0.005)))
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    rng = np.random.default_rng(4)
+    session, truth = synthesize(
+        reference_geometry(rng), rng, sigma_px=0.02, repeatability=REPEATABILITY
+    )
+    return calibrate_hand_eye(session, calibrate_session_cameras(session)), truth
+
+
+@pytest.mark.parametrize(
+    ("sigma", "expected"),
+    [(0.23, 2), (2.3, 1), (23.0, 0), (230.0, 0), (0.0023, 4), (0.1, 2), (0.0, 4)],
+)
+def test_digits_follow_the_uncertainty(sigma, expected):
+    assert digits(sigma) == expected
+
+
+def test_rows_subtract_to_their_errors(calibrated):
+    calibration, truth = calibrated
+    rows = {row["name"]: row for row in result_rows(calibration, truth)}
+    left = rows["left.fx"]
+    fx = truth.cameras[0].intrinsics.fx
+    assert left["value"] - left["error"] == pytest.approx(fx, abs=1e-9)
+    x = rows["base_from_right.x"]
+    true_x = 1e3 * truth.base_from_camera[1].translation[0]
+    assert x["value"] - x["error"] == pytest.approx(true_x, abs=1e-9)
+    assert x["unit"] == "mm"
+    turn = rows["flange_from_triangle.rx"]
+    true_turn = np.degrees(truth.flange_from_triangle.log()[3])
+    # Beyond first order the linear map leaves the square of 1e-4 rad.
+    assert turn["value"] - turn["error"] == pytest.approx(true_turn, abs=1e-5)
+
+
+def test_rows_have_sigmas_that_hold_their_errors(calibrated):
+    ratio = [row["error"] / row["sigma"] for row in result_rows(*calibrated)]
+    assert np.isfinite(ratio).all()
+    assert np.sqrt(np.mean(np.square(ratio))) < 2
+    assert len(ratio) == 2 * 5 + 3 * 6
+
+
+def test_rows_without_truth_have_no_error(calibrated):
+    assert {row["error"] for row in result_rows(calibrated[0], None)} == {None}
+
+
+def evaluation(calibrated, **changes):
+    gate = {
+        "name": "loop", "found": "1.0", "limit": "1.6", "verdict": "good",
+        "blind_to": "scale",
+    }  # fmt: skip
+    return {
+        "verdict": "PASS",
+        "sentence": "Within 0.2 mm.",
+        "nearest": "loop 1.0 (limit 1.6)",
+        "simulated": True,
+        "gates": [gate, {**gate, "name": "touch test", "verdict": "not run"}],
+        "findings": [],
+        "track": {
+            "stations": 6, "mean_mm": 0.0712, "rms_mm": 0.08, "max_mm": 0.15,
+            "predicted_rms_mm": 0.082, "worst_station": 24, "worst_marker": "B",
+            "predicted_parts_mm": {"calibration": 0.03, "pixels": 0.04, "robot": 0.0},
+        },
+        "result": result_rows(*calibrated),
+        **changes,
+    }  # fmt: skip
+
+
+def test_the_verdict_comes_first_and_the_commands_last(calibrated):
+    text = summary_text(evaluation(calibrated), Path("out"), ["report.html", "a.json"])
+    lines = text.splitlines()
+    assert lines[0].startswith("VERDICT  PASS")
+    assert "1 of 1 gates met, 1 not run" in lines[0]
+    assert "0.071 mm mean" in text
+    assert "station 24, marker B" in text
+    assert "pixels 64 % (0.040 mm)" in text
+    assert lines[-1] == "NEXT  handeye-tri replay out"
+    assert "out/report.html   start here" in text
+    assert max(len(line) for line in lines) <= 100
+
+
+def test_without_truth_there_is_no_truth_column(calibrated):
+    bare = evaluation(calibrated, result=result_rows(calibrated[0], None))
+    assert "truth" not in summary_text(bare, Path("out"), [])
+    assert "truth - value" in summary_text(evaluation(calibrated), Path("out"), [])
+
+
+def test_findings_are_told_with_what_to_do(calibrated):
+    finding = {
+        "code": "SCALE", "cause": "metres differ", "evidence": "1.01",
+        "remedy": "measure again",
+    }  # fmt: skip
+    text = summary_text(evaluation(calibrated, findings=[finding]), Path("out"), [])
+    assert "SCALE: metres differ; 1.01" in text
+    assert "Do: measure again." in text
