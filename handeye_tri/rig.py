@@ -86,8 +86,9 @@ def _fork(markers: Floats, order: list[int], centre: Floats, clear: float) -> li
     def at(lateral: float, height: float) -> Floats:
         return np.asarray(lateral * across + (0.0, 0.0, height))
 
-    # The far marker's tine passes the near marker at a distance, then turns in.
-    bend = at(-clear, far[2] - clear)
+    # The far marker's tine turns in as soon as it is beside the near marker: at a
+    # small angle to the axis it comes from behind the marker before and after a turn.
+    bend = at(-clear, near[2])
     ends: list[tuple[str, ArrayLike, ArrayLike]] = [
         ("bar", at(-clear, centre[2]), at(side @ across, centre[2])),
         (f"tine {'ABC'[order[0]]}", centre, near),
