@@ -194,7 +194,7 @@ def test_truth_has_a_row_for_every_label_and_the_error_is_the_tangent(geometry):
 def test_baseline_and_its_sigma_do_not_need_the_stereo_labels(geometry):
     _, truth = synthesize(geometry, np.random.default_rng(1), sigma_px=0.1)
     draws = []
-    for seed in range(300):
+    for seed in range(150):
         change = STD * np.random.default_rng([3, seed]).standard_normal(28)
         row = compare_with_truth(moved(geometry, change), truth)[-1]
         draws.append(row.error)

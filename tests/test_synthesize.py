@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
 from handeye_tri.camera import Lens
 from handeye_tri.errors import InputError, NoPlanError
 from handeye_tri.records import Repeatability
@@ -68,10 +69,41 @@ def test_exact_pixels_are_the_projection_of_the_chain():
     assert session.cameras[0].lens == ("k1", "k2", "p1", "p2")
 
 
-def test_outline_centre_of_a_sphere_is_that_of_its_tangent_cone():
-    geometry = reference_geometry(np.random.default_rng(0))
+LENS = Lens("radtan", np.array([-0.2, 0.1, 2e-3, -1e-3, 0.0]))
+
+
+@pytest.mark.parametrize("lens", [None, LENS], ids=["pinhole", "lens"])
+def test_spheres_are_seen_where_their_area_is(lens):
+    geometry = reference_geometry(np.random.default_rng(0), lens=lens)
+    radii = (8e-3, 0.0, 12e-3)
     session, truth = synthesize(
-        geometry, np.random.default_rng(1), sigma_px=0.0, marker_radii=(8e-3,) * 3
+        geometry, np.random.default_rng(1), sigma_px=0.0, marker_radii=radii
+    )
+    for i, camera in enumerate(geometry.cameras):
+        chain = (
+            se3_inverse(geometry.base_from_camera[i].matrix)
+            @ truth.base_from_flange
+            @ geometry.flange_from_triangle.matrix
+        )
+        points = (
+            geometry.triangle.points @ np.swapaxes(chain[:, :3, :3], 1, 2)
+            + chain[:, None, :3, 3]
+        )
+        shift = session.pixels[i] - camera.project(points)
+        # The closed formula leaves out what a lens does beyond fourth order.
+        np.testing.assert_allclose(
+            shift,
+            sphere_shift(camera, points, radii),
+            atol=1e-8 if lens is None else 2e-4,
+        )
+        assert np.abs(shift[:, 1]).max() < 1e-12
+        assert np.abs(shift[:, 2]).max() > 0.02
+
+
+def test_a_lens_bends_the_outline_as_counting_pixels_says():
+    geometry = reference_geometry(np.random.default_rng(0), lens=LENS)
+    session, truth = synthesize(
+        geometry, np.random.default_rng(1), sigma_px=0.0, marker_radii=(12e-3,) * 3
     )
     camera = geometry.cameras[0]
     chain = (
@@ -80,22 +112,13 @@ def test_outline_centre_of_a_sphere_is_that_of_its_tangent_cone():
         @ geometry.flange_from_triangle.matrix
     )
     x = geometry.triangle.points[1] @ chain[:3, :3].T + chain[:3, 3]
-    # Silhouette of |p| = r around x, found without the closed formula: tangent rays
-    # touch the sphere on a circle; its image is an ellipse, whose centre is the mean
-    # of opposite tangency extremes along each image axis of the bounding box.
-    normal = x / np.linalg.norm(x)
-    side = np.cross(normal, (0.3, 0.1, 0.9))
-    side /= np.linalg.norm(side)
-    up = np.cross(normal, side)
-    distance = np.linalg.norm(x)
-    centre = x * (1 - (8e-3 / distance) ** 2)
-    radius = 8e-3 * np.sqrt(1 - (8e-3 / distance) ** 2)
-    angle = np.linspace(0, 2 * np.pi, 20001)[:, None]
-    circle = centre + radius * (np.cos(angle) * side + np.sin(angle) * up)
-    outline = camera.project(circle)
-    box_centre = 0.5 * (outline.max(axis=0) + outline.min(axis=0))
-    np.testing.assert_allclose(session.pixels[0, 4, 1], box_centre, atol=1e-5)
-    assert np.linalg.norm(box_centre - camera.project(x)) > 1e-3
+    seen = session.pixels[0, 4, 1]
+    # Rays through a grid of 0.1 px that hit the sphere: (d.x)^2 > (x.x - r^2) d.d.
+    side = np.arange(-35, 35, 0.1)
+    grid = np.stack(np.meshgrid(side, side), axis=-1) + np.floor(seen)
+    ray = np.concatenate([camera.normalised(grid), np.ones((*grid.shape[:2], 1))], -1)
+    hit = (ray @ x) ** 2 > (x @ x - 12e-3**2) * (ray * ray).sum(axis=-1)
+    np.testing.assert_allclose(grid[hit].mean(axis=0), seen, atol=3e-3)
 
 
 def test_noise_has_the_stated_size_and_does_not_move_with_the_sigma():

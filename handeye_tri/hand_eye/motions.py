@@ -66,6 +66,11 @@ def check_motions(name: str, motions: ArrayLike, least: int) -> Floats:
 def check_pairs(a: ArrayLike, b: ArrayLike, least: int) -> tuple[Floats, Floats]:
     """Read two lists of motions that belong together, see :func:`check_motions`.
 
+    Args:
+        a: Shape (n, 4, 4), metres.
+        b: Shape (n, 4, 4), metres.
+        least: The smallest n that can be used.
+
     Raises:
         InputError: a list is unusable, or their lengths differ.
     """

@@ -169,6 +169,7 @@ def test_a_third_camera_that_misses_a_marker_still_helps(geometry):
     cameras = dataclasses.replace(
         pair,
         cameras=three.cameras,
+        residuals=np.zeros((3, 1, 3, 2)),
         reference_from_camera=(
             *pair.reference_from_camera,
             geometry.base_from_camera[0].inverse() @ where,
