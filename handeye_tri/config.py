@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -16,11 +17,15 @@ from handeye_tri.triangle import Axis, TriangleRig
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-SCHEMA = "handeye_tri.cell/1"
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Unit = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+    from pydantic_core import ErrorDetails
+
+# Strict: neither "0.03" nor true is a number.
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Unit = Annotated[Number, Field(ge=0, le=1)]
+Count = Annotated[int, Field(strict=True, ge=1)]
+Switch = Annotated[bool, Field(strict=True)]
 Point = tuple[Number, Number, Number]
 
 
@@ -52,7 +57,7 @@ class RigConfig(_Model):
     axis: Axis
     side_ab_mm: Positive
     side_ac_mm: Positive
-    angle_deg: Annotated[float, Field(gt=0, lt=180)]
+    angle_deg: Annotated[Number, Field(gt=0, lt=180)]
     ahead_mm: Positive
     turn_deg: Number = 0.0
     marker_radii_mm: tuple[Positive, Positive, Positive]
@@ -71,6 +76,14 @@ class RigConfig(_Model):
             raise ValueError(
                 "identity: colour needs three different marker_colours; "
                 "use three colours, or identity: radius"
+            )
+        triangle, balls = self.triangle, self.marker_radii_mm
+        sides = 1e3 * np.array([triangle.side_ab, triangle.side_bc, triangle.side_ac])
+        if (sides <= np.add(balls, np.roll(balls, -1))).any():
+            raise ValueError(
+                f"markers of marker_radii_mm {list(balls)} touch each other at "
+                f"sides of {', '.join(f'{side:.1f}' for side in sides)} mm; "
+                "make the markers smaller or the triangle larger"
             )
         radii = sorted(self.marker_radii_mm)
         if self.identity == "radius" and min(np.diff(radii)) < 0.1 * radii[0]:
@@ -137,7 +150,7 @@ class LensConfig(_Model):
 class EstimateConfig(_Model):
     """What is to be estimated of a camera."""
 
-    skew: bool = True
+    skew: Switch = True
     lens_model: Literal["radtan", "rational"] = "radtan"
     lens: tuple[str, ...] = ()
 
@@ -157,7 +170,7 @@ class CameraConfig(_Model):
     """One camera: its truth (for simulation), place, and what is estimated."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
-    image_size_px: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
+    image_size_px: tuple[Count, Count]
     focal_px: tuple[Positive, Positive]
     principal_point_px: tuple[Number, Number]
     skew_px: Number = 0.0
@@ -215,10 +228,10 @@ class CameraConfig(_Model):
 class ImagingConfig(_Model):
     """From the ideal picture to the file."""
 
-    supersample: Annotated[int, Field(ge=1, le=4)] = 2
+    supersample: Annotated[Count, Field(le=4)] = 2
     noise_percent: NotNegative = 0.0
     blur_px: NotNegative = 0.0
-    grey: bool = False
+    grey: Switch = False
 
 
 class BoxConfig(_Model):
@@ -232,10 +245,10 @@ class BoxConfig(_Model):
 class PlanConfig(_Model):
     """What a programme must satisfy."""
 
-    half_turns: Annotated[int, Field(ge=2)] = 11
-    evaluation_stations: Annotated[int, Field(ge=1)] = 6
-    min_plane_spread_deg: Annotated[float, Field(gt=0, le=60)] = 20.0
-    max_tilt_deg: Annotated[float, Field(gt=0, lt=90)] = 55.0
+    half_turns: Annotated[Count, Field(ge=2)] = 11
+    evaluation_stations: Count = 6
+    min_plane_spread_deg: Annotated[Number, Field(gt=0, le=60)] = 20.0
+    max_tilt_deg: Annotated[Number, Field(gt=0, lt=90)] = 55.0
     image_margin_px: NotNegative = 20.0
     workspace_min_m: Point
     workspace_max_m: Point
@@ -246,7 +259,7 @@ class PlanConfig(_Model):
         if not (sides > 0).all():
             raise ValueError(
                 "workspace_max_m must exceed workspace_min_m on every axis, "
-                f"got sides {sides.tolist()} m"
+                f"got sides {sides.round(6).tolist()} m"
             )
         return self
 
@@ -293,20 +306,66 @@ def parse_cell(data: Mapping[str, object], source: str) -> Cell:
     try:
         return Cell.model_validate(data)
     except ValidationError as error:
-        problems = [
-            f"{'.'.join(str(part) for part in e['loc']) or 'the cell'}: "
-            + _explain(e["type"], e["msg"], e["input"])
-            for e in error.errors(include_url=False)
-        ]
-        raise InputError(f"{source}: " + "; ".join(problems)) from None
+        problems = _problems(error.errors(include_url=False))
+        text = "; ".join(f"{key or 'the cell'}: {what}" for key, what in problems)
+        raise InputError(f"{source}: {text}") from None
 
 
-def _explain(kind: str, message: str, value: object) -> str:
-    if kind == "extra_forbidden":
-        return "this key is not known here; remove it or check its spelling and unit"
+_SECTIONS: dict[str, type[_Model]] = {
+    "arm": ArmConfig,
+    "rig": RigConfig,
+    "cameras": CameraConfig,
+    "lens": LensConfig,
+    "estimate": EstimateConfig,
+    "imaging": ImagingConfig,
+    "surroundings": BoxConfig,
+    "plan": PlanConfig,
+}
+
+
+def _problems(errors: list[ErrorDetails]) -> list[tuple[str, str]]:
+    """Dotted keys with what is wrong there, each cause once."""
+    found = {".".join(str(part) for part in error["loc"]): error for error in errors}
+    spoken_for = set()
+    for key, error in found.items():
+        if error["type"] == "extra_forbidden":
+            # The key that was meant is reported missing too.
+            place = key.rpartition(".")[0]
+            spoken_for.add(f"{place}.{_meant(error['loc'])}".lstrip("."))
+        elif error["type"] == "too_short" and any(
+            k.startswith(f"{key}.") for k in found
+        ):
+            # Entries that were refused are not counted.
+            spoken_for.add(key)
+    return [(k, _explain(error)) for k, error in found.items() if k not in spoken_for]
+
+
+def _meant(location: tuple[int | str, ...]) -> str:
+    """The known key nearest to the unknown one at ``location``, or ""."""
+    names = [part for part in location[:-1] if isinstance(part, str)]
+    section = _SECTIONS[names[-1]] if names else Cell
+    known = [field.alias or name for name, field in section.model_fields.items()]
+    return next(iter(get_close_matches(str(location[-1]), known, n=1)), "")
+
+
+def _explain(error: ErrorDetails) -> str:
+    kind, text = error["type"], error["msg"].removeprefix("Value error, ")
     if kind == "missing":
         return "this key is missing; add it"
-    text = message.removeprefix("Value error, ")
     if kind == "value_error":
         return text
-    return f"{text[0].lower()}{text[1:]}, got {value!r}"
+    if kind == "extra_forbidden":
+        key, meant = str(error["loc"][-1]), _meant(error["loc"])
+        if not meant:
+            return "this key is not known here; remove it"
+        if key.rpartition("_")[0] == meant.rpartition("_")[0] != "":
+            return f"this key is not known here; convert the value and call it {meant}"
+        return f"this key is not known here; did you mean {meant}?"
+    value = repr(error["input"])
+    value = value if len(value) <= 60 else f"{value[:57]}..."
+    if kind == "too_short":
+        least = error["ctx"]["min_length"]
+        return f"at least {least} are needed, got {error['ctx']['actual_length']}"
+    if kind in ("model_type", "dict_type"):
+        return f"this must be a mapping of keys, got {value}"
+    return f"{text[0].lower()}{text[1:]}, got {value}"

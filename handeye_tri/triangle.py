@@ -78,6 +78,8 @@ class TriangleRig:
         # Half-angle form (Kahan): keeps its digits at every angle.
         u, v = ab / lengths[0], ac / lengths[1]
         angle = 2 * np.arctan2(np.linalg.norm(u - v), np.linalg.norm(u + v))
+        if angle in (0, np.pi):
+            raise InputError("A, B and C are collinear; move one marker off the line")
         return cls(*lengths, float(angle))
 
     @property
