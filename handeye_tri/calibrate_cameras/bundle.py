@@ -28,26 +28,16 @@ from handeye_tri.calibrate_cameras.bundle_model import (
     State,
     Turns,
 )
-from handeye_tri.calibrate_cameras.degeneracy import scaled_condition
+from handeye_tri.calibrate_cameras.bundle_result import bundle_result
 from handeye_tri.calibrate_cameras.least_squares import Minimum, minimise
-from handeye_tri.camera import INTRINSIC_NAMES, Intrinsics, Lens, PinholeCamera
-from handeye_tri.errors import ConvergenceError, DegenerateMotionError, InputError
-from handeye_tri.records import (
-    CameraCalibration,
-    Covariance,
-    HalfTurn,
-    motion_labels,
-)
+from handeye_tri.camera import PinholeCamera
+from handeye_tri.errors import DegenerateMotionError, InputError
+from handeye_tri.records import CameraCalibration, HalfTurn
 from handeye_tri.se3 import SE3
 from handeye_tri.triangle import EDGES, Axis, TriangleRig
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
-
-# A focal length whose sigma is a larger part of it than this is not determined.
-_MAX_RELATIVE_SIGMA = 0.5
-# Scaled information worse conditioned than this is singular in double precision.
-_MAX_CONDITION = 1e14
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,17 +48,25 @@ class TurnNoise:
         covariance: Of the tangent xi (translation m, rotation rad) by which a half-turn
             misses, ``after = before @ half_turn @ exp(xi)`` in the triangle's
             frame, shape (6, 6); zero for a perfect robot. The line itself, where the
-            half-turns' axis truly runs in the triangle's frame, is estimated.
+            half-turns' axis truly runs in the triangle's frame, is estimated. None
+            leaves the two poses independent of each other.
         on_axis_correlation: Correlation of a marker's detection errors before and
             after, for the two markers on an edge axis. They are seen twice at the same
             place, and what a detector gets wrong there, it gets wrong twice.
     """
 
-    covariance: Floats
+    covariance: Floats | None = None
     on_axis_correlation: float = 0.0
 
     def __post_init__(self) -> None:
         """Raise InputError where this is no covariance or no correlation."""
+        if not 0 <= self.on_axis_correlation < 1:
+            raise InputError(
+                "on_axis_correlation must be at least 0 and below 1, "
+                f"got {self.on_axis_correlation}"
+            )
+        if self.covariance is None:
+            return
         matrix = np.asarray(self.covariance, dtype=float)
         if matrix.shape != (6, 6) or not np.isfinite(matrix).all():
             raise InputError(
@@ -84,15 +82,12 @@ class TurnNoise:
             raise InputError(
                 "a turn's covariance must be symmetric and positive semi-definite"
             )
-        if not 0 <= self.on_axis_correlation < 1:
-            raise InputError(
-                "on_axis_correlation must be at least 0 and below 1, "
-                f"got {self.on_axis_correlation}"
-            )
 
     @property
-    def root(self) -> Floats:
+    def root(self) -> Floats | None:
         """A square root of the covariance, shape (6, 6)."""
+        if self.covariance is None:
+            return None
         values, vectors = np.linalg.eigh(self.covariance)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
@@ -145,9 +140,9 @@ def bundle_cameras(
         - "reference_from_triangle": (n, 4, 4), and "station_covariance" of its tangents
           (n, 6, 6), NaN where not used;
         - "used": indices of the stations used; "iterations";
-        - with turn noise, "turn_sigmas": (len(half_turns), 6), the deviation of each
-          half-turn over its prior's root, NaN where not used; "axes": the names of the
-          axes and "triangle_from_axis": (a, 4, 4), whose z axes are where they run.
+        - with a covariance in turn_noise, "turn_sigmas": (len(half_turns), 6), the
+          deviation of each half-turn over its prior's root, NaN where not used; "axes":
+          names of the axes; "triangle_from_axis": (a, 4, 4), they run along its z.
 
     Raises:
         InputError: an argument cannot be used; names it.
@@ -198,7 +193,7 @@ def bundle_cameras(
     )
     start.reference_from_camera[0] = np.eye(4)
     end = _minimum(model, start, names)
-    return _result(
+    return bundle_result(
         model, end, cameras, blocks, members, len(half_turns), kinds, seen.shape[1]
     )
 
@@ -223,7 +218,7 @@ def _turns(
         kind[block] = kinds.index(axis)
         if axis != "normal":
             correlation[block, list(EDGES[axis])] = noise.on_axis_correlation
-    return Turns(paired, kind, np.broadcast_to(noise.root, (blocks, 6, 6)), correlation)
+    return Turns(paired, kind, noise.root, correlation)
 
 
 def _nominal_axis(triangle: TriangleRig, axis: Axis) -> Floats:
@@ -262,135 +257,3 @@ def _minimum(
     end = minimise(model.evaluate, model.retract, start, rounding)
     assert end is not None
     return end
-
-
-def _camera_labels(
-    cameras: Sequence[PinholeCamera], model: BundleModel
-) -> tuple[list[str], list[int]]:
-    """Labels of the cameras' unknowns, intrinsics before places, and their columns."""
-    inner: list[tuple[str, int]] = []
-    places: list[tuple[str, int]] = []
-    for i, camera in enumerate(cameras):
-        labels = [INTRINSIC_NAMES[index] for index in model.intrinsics[i]]
-        labels += [camera.lens.names[index] for index in model.lenses[i]]
-        start = model.columns[i].start
-        inner += [
-            (f"{camera.name}.{label}", start + j) for j, label in enumerate(labels)
-        ]
-        if i:
-            start += len(labels)
-            places += [
-                (label, start + j)
-                for j, label in enumerate(
-                    motion_labels(f"reference_from_{camera.name}")
-                )
-            ]
-    both = inner + places
-    return [label for label, _ in both], [column for _, column in both]
-
-
-def _result(
-    model: BundleModel,
-    end: Minimum[State, Linearisation],
-    cameras: Sequence[PinholeCamera],
-    blocks: Indices,
-    members: Indices,
-    half_turns: int,
-    kinds: tuple[Axis, ...],
-    n: int,
-) -> CameraCalibration:
-    state, normal = end.state, end.blocks.normal
-    information = normal.reduced()
-    condition = scaled_condition(information)
-    labels, columns = _camera_labels(cameras, model)
-    if condition > _MAX_CONDITION:
-        raise DegenerateMotionError(
-            f"the cameras are not determined (condition {condition:.2g} of "
-            f"{len(labels)} unknowns): the triangle's planes may be parallel at all "
-            "stations; tilt it at least 20 degrees between stations, or estimate fewer "
-            "lens coefficients"
-        )
-    scale = 1.0 / np.sqrt(np.diagonal(information))
-    shared = np.linalg.inv(information * np.outer(scale, scale))
-    shared = 0.5 * (shared + shared.T) * np.outer(scale, scale)
-    covariance = Covariance(tuple(labels), shared[np.ix_(columns, columns)])
-    for camera, vector in zip(cameras, state.intrinsics, strict=True):
-        for label, focal in zip(("fx", "fy"), vector[:2], strict=True):
-            sigma = covariance.std(f"{camera.name}.{label}")
-            if sigma > _MAX_RELATIVE_SIGMA * focal:
-                raise DegenerateMotionError(
-                    f"{camera.name}.{label} = {focal:.1f} px has a predicted sigma of "
-                    f"{sigma:.1f} px: the stations do not determine it; add stations "
-                    "with the triangle tilted at least 20 degrees and larger in the "
-                    "image"
-                )
-    if not end.converged:
-        raise ConvergenceError(
-            f"the adjustment did not settle in {end.iterations} iterations (chi2 "
-            f"{end.cost_start:.4g} to {end.cost:.4g}); start nearer, or estimate fewer "
-            "lens coefficients"
-        )
-    calibrated = tuple(
-        PinholeCamera(
-            camera.name,
-            Intrinsics.from_vector(state.intrinsics[i]),
-            camera.image_size,
-            Lens(camera.lens.model, state.lenses[i]),
-        )
-        for i, camera in enumerate(cameras)
-    )
-    present = blocks >= 0
-    residuals = np.full((len(cameras), n, 3, 2), np.nan)
-    residuals[:, blocks[present]] = np.where(
-        model.seen[..., None], -end.blocks.residuals, np.nan
-    )[:, present]
-    details = {
-        "reference_from_triangle": _whole(
-            model.poses(state)[present], blocks[present], n
-        ),
-        "station_covariance": _whole(
-            _station_covariance(model, end, shared)[present], blocks[present], n
-        ),
-        "used": np.sort(blocks[present]),
-        "iterations": end.iterations,
-    }
-    if model.turns is not None:
-        details["turn_sigmas"] = _whole(state.turn[: len(members)], members, half_turns)
-        details["axes"] = kinds
-        details["triangle_from_axis"] = state.lines
-    return CameraCalibration(
-        cameras=calibrated,
-        reference_from_camera=tuple(SE3(m) for m in state.reference_from_camera),
-        covariance=covariance,
-        chi2=end.cost,
-        dof=end.blocks.observations - end.blocks.unknowns,
-        residuals=residuals,
-        condition=condition,
-        cost_start=end.cost_start,
-        method="bundle adjustment"
-        + ("" if model.turns is None else " with half-turns")
-        + (f", huber {model.huber:g}" if np.isfinite(model.huber) else ""),
-        details=details,
-    )
-
-
-def _whole(values: Floats, rows: Indices, n: int) -> Floats:
-    """Values in the order of all n stations or half-turns, NaN where unused; locked."""
-    result = np.full((n, *values.shape[1:]), np.nan)
-    result[rows] = values
-    result.setflags(write=False)
-    return result
-
-
-def _station_covariance(
-    model: BundleModel, end: Minimum[State, Linearisation], shared: Floats
-) -> Floats:
-    """Marginal covariance of each station's tangent, shape (b, w, 6, 6)."""
-    normal = end.blocks.normal
-    gain = np.linalg.solve(normal.own, normal.cross)
-    spread = gain @ shared
-    own = np.linalg.inv(normal.own) + spread @ np.swapaxes(gain, -1, -2)
-    lines = shared[model.cameras_stop :, model.cameras_stop :]
-    below = np.broadcast_to(lines, (len(own), *lines.shape))
-    cross = np.concatenate([-spread[..., model.cameras_stop :], below], axis=1)
-    return model.station_covariance(end.state, own, cross)

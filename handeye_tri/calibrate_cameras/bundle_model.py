@@ -2,8 +2,8 @@
 
 Stations come in blocks: alone, or the two of a half-turn. A block's own unknowns are
 the pose of its first station and, for a half-turn, by how much the turn missed:
-``after = before @ half_turn @ exp(root @ turn)`` with ``turn ~ N(0, I)``. The line
-of the half-turns in the triangle's frame is shared and unknown, so that neither an
+``after = before @ half_turn @ exp(root @ turn)`` with ``turn ~ N(0, I)``, or free. The
+line of the half-turns in the triangle's frame is shared and unknown, so that neither an
 inexact robot nor an inexact rig is taken for exact. Everything runs over blocks at
 once; the only loop is over cameras.
 """
@@ -64,13 +64,14 @@ class Turns:
     Attributes:
         paired: Whether the block has a second station, shape (b,).
         kind: Index of each block's line, shape (b,).
-        root: Square root of the covariance of each turn's tangent, (b, 6, 6), m, rad.
+        root: Square root of the covariance of each turn's tangent, (6, 6), m, rad; None
+            where the two poses are independent and only detection errors tie them.
         correlation: Of the detection errors of one marker before and after, (b, 3).
     """
 
     paired: Bools
     kind: NDArray[np.intp]
-    root: Floats
+    root: Floats | None
     correlation: Floats
 
 
@@ -138,13 +139,18 @@ class BundleModel:
             columns.append(slice(start, stop))
             start = stop
         object.__setattr__(self, "columns", tuple(columns))
-        lines = 0 if self.turns is None else int(self.turns.kind.max()) + 1
+        lines = int(self.turns.kind.max()) + 1 if self.turns and self.tied else 0
         object.__setattr__(self, "shared", start + _LINE_UNKNOWNS * lines)
 
     @property
     def own(self) -> int:
         """Own unknowns of a block."""
         return 6 if self.turns is None else 12
+
+    @property
+    def tied(self) -> bool:
+        """Whether the poses of a half-turn's two stations depend on each other."""
+        return self.turns is not None and self.turns.root is not None
 
     @property
     def cameras_stop(self) -> int:
@@ -160,12 +166,13 @@ class BundleModel:
         """
         line = state.lines[turns.kind]
         motion = line @ _HALF_TURN @ se3_inverse(line)
-        xi = (turns.root @ state.turn[..., None])[..., 0]
+        root = np.eye(6) if turns.root is None else turns.root
+        xi = state.turn @ root.T
         missed = se3_exp(xi)
         after = motion @ missed
         by_own = np.empty((len(xi), 6, 12))
         by_own[..., :6] = se3_adjoint(se3_inverse(after))
-        by_own[..., 6:] = np.linalg.inv(se3_left_jacobian_inverse(-xi)) @ turns.root
+        by_own[..., 6:] = np.linalg.inv(se3_left_jacobian_inverse(-xi)) @ root
         by_line = se3_adjoint(se3_inverse(missed) @ line) @ _LINE_TANGENT
         return state.first @ after, by_own, by_line
 
@@ -190,8 +197,11 @@ class BundleModel:
         blocks, size = len(own), own.shape[-1]
         rows = np.zeros((blocks, 6, size + cross.shape[-1]))
         rows[..., :size] = by_own
-        place = size + _LINE_UNKNOWNS * self.turns.kind[:, None] + np.arange(4)
-        np.put_along_axis(rows, np.repeat(place[:, None], 6, axis=1), by_line, axis=2)
+        if not self.tied:
+            by_line = by_line[..., :0]
+        place = _LINE_UNKNOWNS * self.turns.kind[:, None] + np.arange(by_line.shape[-1])
+        place = np.repeat(size + place[:, None], 6, axis=1)
+        np.put_along_axis(rows, place, by_line, axis=2)
         whole = np.empty((blocks, rows.shape[-1], rows.shape[-1]))
         whole[:, :size, :size] = own
         whole[:, :, size:] = cross
@@ -208,7 +218,8 @@ class BundleModel:
         if self.turns is not None:
             second, by_own, by_line = self._turned(state, self.turns)
             stations = np.stack([state.first, second], axis=1)
-            mixing = _mixing(self.turns.correlation)
+            if self.turns.correlation.any():
+                mixing = _mixing(self.turns.correlation)
         rotation = stations[..., :3, :3]
         points = (
             self.points @ np.swapaxes(rotation, -1, -2) + stations[..., None, :3, 3]
@@ -244,15 +255,15 @@ class BundleModel:
                 parts += [-by_point, by_point @ hat(local)]
             parts.append(whitener @ missed[i][..., None])
             rows = np.concatenate(parts, axis=-1)
+            place = np.r_[columns]
+            if by_own is not None and by_line is not None:
+                rows = self._chain(rows, by_own, by_line, g - self.cameras_stop)
+                place = np.r_[columns, self.cameras_stop : g]
             if mixing is not None:
                 both = (seen[:, 0] & seen[:, 1])[:, :, None, None]
                 mixed = np.where(both, mixing, np.eye(2))
                 rows = np.einsum("bkuv,bvkpq->bukpq", mixed, rows)
             cost += _robust(rows, self.huber)
-            place = np.r_[columns]
-            if by_own is not None and by_line is not None:
-                rows = self._chain(rows, by_own, by_line, g - self.cameras_stop)
-                place = np.r_[columns, self.cameras_stop : g]
             rows = rows.reshape(blocks, width * 6, -1)
             product = np.swapaxes(rows[..., :size], -1, -2) @ rows
             own += product[..., :size]
@@ -265,11 +276,15 @@ class BundleModel:
         observations = 2 * int(self.seen.sum())
         unknowns = 6 * blocks + g
         if self.turns is not None:
-            cost += float(np.vdot(state.turn, state.turn))
-            own[:, 6:, 6:] += np.eye(6)
-            own_gradient[:, 6:] += state.turn
-            observations += 6 * int(self.turns.paired.sum())
-            unknowns += 6 * int(self.turns.paired.sum())
+            paired = self.turns.paired
+            unknowns += 6 * int(paired.sum())
+            # Without a second station nothing depends on the turn: it stays zero.
+            own[~paired, 6:, 6:] = np.eye(6)
+            if self.tied:
+                cost += float(np.vdot(state.turn, state.turn))
+                own[paired, 6:, 6:] += np.eye(6)
+                own_gradient[:, 6:] += state.turn
+                observations += 6 * int(paired.sum())
         return Linearisation(
             cost,
             observations,
@@ -322,6 +337,7 @@ class BundleModel:
         lines, turn = state.lines, state.turn
         if self.turns is not None:
             turn = turn + own[:, 6:]
+        if self.tied:
             tangent = np.zeros((len(lines), 6))
             tangent[:, (0, 1, 3, 4)] = shared[self.cameras_stop :].reshape(-1, 4)
             lines = lines @ se3_exp(tangent)
