@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri, fdtri
 
 from handeye_tri.calibrate_cameras.closed_form import NOMINAL_FOCAL
 from handeye_tri.calibrate_cameras.half_turns import HalfTurnData
@@ -29,10 +30,13 @@ _MIN_PLANE_SPREAD_DEG = 0.5
 # Homography residual over the triangle's mean side in the image; 2 degrees off a
 # half-turn make about 0.01.
 _MAX_TURN_RESIDUAL = 0.05
-# A focal length whose sigma is a larger part of it than this is not determined.
-_MAX_RELATIVE_SIGMA = 0.5
+# Chance that noise alone makes parallel planes look different.
+_CHANCE = 1e-3
+# A focal length whose sigma is a larger part of it than this is not determined: four
+# sigmas reach zero and infinity, and sigma itself means nothing.
+_MAX_RELATIVE_SIGMA = 0.25
 # Scaled information worse conditioned than this is singular in double precision.
-_MAX_CONDITION = 1e14
+_MAX_CONDITION = 1e13
 # Noise that is assumed at least where the residuals are at rounding, pixels.
 _LEAST_NOISE_PX = 1e-3
 
@@ -90,9 +94,7 @@ def check_axis_ends(triangle: TriangleRig, axes: Sequence[Axis]) -> None:
                 )
 
 
-def check_turns(
-    data: HalfTurnData, homographies: Homographies, used: NDArray[np.intp]
-) -> None:
+def check_turns(data: HalfTurnData, homographies: Homographies) -> None:
     """Refuse images that are no half-turn about the stated axis, whatever K is.
 
     One plane must map to both images of a half-turn. An inexact robot misses that by
@@ -108,8 +110,8 @@ def check_turns(
     if residual <= _MAX_TURN_RESIDUAL * side[worst]:
         return
     raise DegenerateMotionError(
-        f"half-turn {used[worst]} is no half-turn about {data.axes[worst]!r}: no plane "
-        f"fits the images before and after it, RMS residual {residual:.2f} px for a "
+        f"half-turn {data.index[worst]} is no half-turn about {data.axes[worst]!r}: no "
+        f"plane fits its two images, RMS residual {residual:.2f} px for a "
         f"triangle of {side[worst]:.0f} px; check the axis, the triangle, the order of "
         "A, B, C and which images belong together"
     )
@@ -132,8 +134,8 @@ def check_planes(homographies: Homographies, noise_known: bool) -> None:
     """Refuse planes that cannot be told from parallel ones (Proposition 1).
 
     The vanishing lines of parallel planes are equal, whatever K is. If their scatter
-    is within what the pixel noise explains (chi-square, three of its own standard
-    deviations above its mean), or the planes are within half a degree, K is
+    is within what the pixel noise explains (chi-square, or Fisher's F where the noise
+    is itself estimated; 1 in 1000), or the planes are within half a degree, K is
     undetermined.
 
     Args:
@@ -156,13 +158,17 @@ def check_planes(homographies: Homographies, noise_known: bool) -> None:
     )
     chi2 = float(np.einsum("ni,nij,nj->", line - mean, weight, line - mean))
     freedom = 2 * (len(line) - 1)
-    explained = chi2 <= freedom + 3.0 * np.sqrt(2.0 * freedom)
+    if noise_known:
+        limit = float(chdtri(freedom, _CHANCE))
+    else:
+        limit = freedom * float(fdtri(freedom, homographies.dof, 1.0 - _CHANCE))
+    explained = chi2 <= limit
     if not explained and spread >= _MIN_PLANE_SPREAD_DEG:
         return
     tilt = float(np.degrees(np.arccos(normals[:, 2].clip(-1.0, 1.0))).max())
     facing = " (all of them face the camera: fronto-parallel)" if tilt < 10 else ""
     scatter = (
-        f"its scatter is no more than noise, chi2 {chi2:.1f} for {freedom}"
+        f"its scatter is no more than noise, chi2 {chi2:.1f} of {limit:.1f}"
         if explained
         else "the same plane to within half a degree"
     )
@@ -174,13 +180,33 @@ def check_planes(homographies: Homographies, noise_known: bool) -> None:
     )
 
 
-def scaled_condition(information: Floats) -> float:
-    """Condition number of an information matrix scaled to a unit diagonal."""
+def invert_information(information: Floats) -> tuple[Floats, float]:
+    """Covariance of an information matrix, and its condition scaled to unit diagonal.
+
+    Through the eigenvalues of the scaled matrix, so that variances of nearly
+    undetermined unknowns stay positive; infinite where the matrix is singular.
+
+    Args:
+        information: Shape (p, p).
+
+    Returns:
+        Shape (p, p); the condition number, infinite where singular.
+    """
     diagonal = np.sqrt(np.diagonal(information))
-    if not (diagonal > 0).all() or not np.isfinite(information).all():
-        return float("inf")
-    values = np.linalg.eigvalsh(information / np.outer(diagonal, diagonal))
-    return float("inf") if values[0] <= 0 else float(values[-1] / values[0])
+    nothing = np.full(information.shape, np.inf)
+    if not np.isfinite(information).all() or not (diagonal > 0).all():
+        return nothing, float("inf")
+    scale = np.outer(diagonal, diagonal)
+    values, vectors = np.linalg.eigh(information / scale)
+    if values[0] <= 0:
+        return nothing, float("inf")
+    covariance = (vectors / values) @ vectors.T / scale
+    return 0.5 * (covariance + covariance.T), float(values[-1] / values[0])
+
+
+def scaled_condition(information: Floats) -> float:
+    """Condition number of an information matrix, (p, p), scaled to unit diagonal."""
+    return invert_information(information)[1]
 
 
 def check_determined(

@@ -32,6 +32,7 @@ class HalfTurnData:
         offset: Its translation where O is the origin, shape (n, 3), metres.
         about_normal: Which half-turns depend on O, shape (n,), 1.0 or 0.0.
         image_size: (width, height), pixels.
+        index: Which half-turn of the caller each is, shape (n,).
     """
 
     pixels: Floats
@@ -42,6 +43,7 @@ class HalfTurnData:
     offset: Floats
     about_normal: Floats
     image_size: tuple[int, int]
+    index: NDArray[np.intp]
 
     def __len__(self) -> int:
         """Number of half-turns."""
@@ -112,6 +114,7 @@ def read_half_turns(
         np.array([motions[name].translation for name in kept]).reshape(-1, 3),
         np.array([float(name == "normal") for name in kept]),
         (int(image_size[0]), int(image_size[1])),
+        used,
     )
     return data, used
 
@@ -215,5 +218,5 @@ def _check_pixels(
             raise DegenerateMotionError(
                 f"half-turn {used[i]} about {axis!r} moved A, B, C by only "
                 f"{', '.join(f'{d:.3f}' for d in moved[i])} px: the image after it "
-                "shows the triangle unturned; check the order of the images"
+                "shows the triangle unturned; check axis and order of the images"
             )

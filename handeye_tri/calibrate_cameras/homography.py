@@ -9,7 +9,6 @@ all that the half-turn says of the camera: h1' w h2 = 0, h1' w h1 = h2' w h2.
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 from typing import Literal
 
@@ -178,16 +177,15 @@ def fit_homographies(
 
     rounding = float(np.finfo(float).eps * whitener.max())
     end = minimise(evaluate, retract, start, rounding, max_iterations=30)
-    covariance = None
-    if end is not None:
-        with contextlib.suppress(np.linalg.LinAlgError):
-            covariance = NormalEquations.of(end.blocks).own_covariance()[:, :8, :8]
-    if end is None or covariance is None:
-        raise DegenerateMotionError(
-            "no plane maps to the images before and after the half-turns with every "
-            "marker in front of the camera; check axis, triangle and the order of A, "
-            "B, C"
-        )
+    if end is None:
+        depths = homogeneous(plane(start.o)) @ start.matrix[:, None, 2, :, None]
+        worst = int(np.argmin(depths.min(axis=(1, 2, 3))))
+        raise _no_plane(data, worst)
+    try:
+        covariance = NormalEquations.of(end.blocks).own_covariance()[:, :8, :8]
+    except np.linalg.LinAlgError:
+        worst = int(np.argmax((end.blocks.residuals**2).sum(axis=1)))
+        raise _no_plane(data, worst) from None
     missed = np.linalg.solve(
         data.whitener, end.blocks.residuals.reshape(n, 2, 3, 2)[..., None]
     )
@@ -203,6 +201,14 @@ def fit_homographies(
         end.cost,
         np.sqrt(np.mean(missed**2, axis=(1, 2, 3, 4))),
         max(12 * n - 8 * n - feet_unknown, 1),
+    )
+
+
+def _no_plane(data: HalfTurnData, worst: int) -> DegenerateMotionError:
+    return DegenerateMotionError(
+        f"half-turn {data.index[worst]} is no half-turn about {data.axes[worst]!r}: no "
+        "plane maps to the images before and after it with every marker in front of "
+        "the camera; check the axis, the triangle and the order of A, B, C"
     )
 
 

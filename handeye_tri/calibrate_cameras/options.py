@@ -53,6 +53,9 @@ def lens_choice(
 def o_choice(o: Literal["shared", "free"] | ArrayLike) -> tuple[OMode, Floats | None]:
     """How the foot O of a normal axis is treated, and where it is if that is known.
 
+    Args:
+        o: "shared", "free", or the known foot, shape (2,), metres.
+
     Raises:
         InputError: neither a known word nor two finite numbers.
     """

@@ -20,9 +20,9 @@ from handeye_tri.calibrate_cameras.degeneracy import (
     check_determined,
     check_planes,
     check_turns,
+    invert_information,
     least_noise,
     plane_spread_deg,
-    scaled_condition,
 )
 from handeye_tri.calibrate_cameras.extrinsics import poses_from_homographies
 from handeye_tri.calibrate_cameras.half_turns import HalfTurnData, read_half_turns
@@ -160,7 +160,7 @@ def calibrate_camera(
     )
     check_axis_ends(triangle, data.axes)
     homographies = fit_homographies(data, o_mode, known_o)
-    check_turns(data, homographies, used)
+    check_turns(data, homographies)
     check_planes(homographies, noise_known)
 
     first: ClosedForm | None = None
@@ -237,7 +237,7 @@ def _stop_at_closed_form(
     noise = homographies.chi2 / homographies.dof
     rows = np.ix_(model.intrinsics, model.intrinsics)
     covariance = first.covariance[rows]
-    condition = scaled_condition(NormalEquations.of(blocks).reduced())
+    _, condition = invert_information(NormalEquations.of(blocks).reduced())
     sigma = np.sqrt(np.diagonal(covariance)[:2] * least_noise(noise, noise_known))
     check_determined(
         condition, state.intrinsics[:2], sigma, plane_spread_deg(state.poses[:, :3, 2])
@@ -275,14 +275,11 @@ def _refined(
     end, chosen = found
     state = end.state
     equations = NormalEquations.of(end.blocks)
-    information = equations.reduced()
-    condition = scaled_condition(information)
-    noise = end.cost / model.dof
+    covariance, condition = invert_information(equations.reduced())
     count = model.camera_unknowns
+    covariance = covariance[:count, :count]
+    noise = end.cost / model.dof
     spread = plane_spread_deg(state.poses[:, :3, 2])
-    covariance = np.full((count, count), np.inf)
-    if np.isfinite(condition):
-        covariance = np.linalg.inv(information)[:count, :count]
     sigma = np.sqrt(np.diagonal(covariance)[:2] * least_noise(noise, noise_known))
     check_determined(condition, state.intrinsics[:2], sigma, spread)
     if not end.converged:
@@ -291,11 +288,10 @@ def _refined(
             f"{end.cost_start:.4g} to {end.cost:.4g} for {model.dof} degrees of "
             "freedom); estimate fewer lens coefficients or add half-turns"
         )
-    covariance = covariance * (1.0 if noise_known else noise)
     closed_cost = None if first is None else model.evaluate(closed)
     return _Outcome(
         state,
-        0.5 * (covariance + covariance.T),
+        covariance * (1.0 if noise_known else noise),
         end.cost,
         condition,
         end.cost_start if closed_cost is None else closed_cost.cost,
