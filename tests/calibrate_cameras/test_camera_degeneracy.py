@@ -1,0 +1,221 @@
+"""Data that do not determine a camera, and data that are no half-turns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from half_turn_scene import IMAGE_SIZE, TRIANGLE, make_scene
+
+from handeye_tri.calibrate_cameras import calibrate_camera
+from handeye_tri.errors import DegenerateMotionError, HandEyeError, InputError
+from handeye_tri.triangle import TriangleRig
+
+SIGMA = 0.1
+
+
+def calibrate(scene, before=None, after=None, **options):
+    return calibrate_camera(
+        scene.before if before is None else before,
+        scene.after if after is None else after,
+        scene.triangle,
+        image_size=IMAGE_SIZE,
+        **{"axis": scene.axes, **options},
+    )
+
+
+@pytest.mark.parametrize("axis", ["normal", "CA"])
+@pytest.mark.parametrize("sigma", [0.0, 0.1, 0.5])
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("tilt", [0.0, 40.0])
+def test_parallel_planes_are_refused_with_their_spread(
+    axis, sigma, known, tilt
+) -> None:
+    for seed in range(5):
+        rng = np.random.default_rng([7, seed])
+        scene = make_scene(rng, 8, axis, tilt_deg=(tilt, tilt), azimuths=[0.3] * 8)
+        options = {"sigma_px": sigma} if known and sigma else {}
+        message = r"planes are parallel in all 8 half-turns: spread \d+\.\d+ degrees"
+        if tilt == 0.0:
+            message += ".*fronto-parallel"
+        with pytest.raises(DegenerateMotionError, match=message):
+            calibrate(scene, *scene.noisy(rng, sigma), **options)
+
+
+@pytest.mark.parametrize("axis", ["normal", "CA"])
+def test_planes_that_differ_are_not_called_parallel(axis) -> None:
+    for seed in range(20):
+        rng = np.random.default_rng([8, seed])
+        scene = make_scene(rng, 8, axis)
+        assert calibrate(scene, *scene.noisy(rng, 0.5), sigma_px=0.5).dof > 0
+
+
+@pytest.mark.parametrize("axis", ["normal", "CA"])
+@pytest.mark.parametrize("sigma", [0.0, 0.1, 0.5])
+def test_two_planes_determine_four_unknowns_and_not_five(axis, sigma) -> None:
+    rng = np.random.default_rng(9)
+    azimuths = [0.0, 1.6] * 5
+    scene = make_scene(rng, 10, axis, tilt_deg=(40, 40), azimuths=azimuths)
+    seen = scene.noisy(rng, sigma)
+    with pytest.raises(DegenerateMotionError, match="do not determine the focal"):
+        calibrate(scene, *seen)
+    assert calibrate(scene, *seen, skew=False).dof == 60 - 4 - 2 * (axis == "normal")
+
+
+@pytest.mark.parametrize(
+    ("n", "options", "message"),
+    [
+        (0, {}, "0 half-turns are too few.*at least 3"),
+        (2, {}, r"2 half-turns are too few.*at least 3.*skew=False"),
+        (1, {"skew": False}, "1 half-turns are too few.*at least 2"),
+        (2, {"skew": False, "distortion": "rational"}, "at least 3 are needed"),
+    ],
+)
+def test_too_few_half_turns_say_how_many_are_needed(n, options, message) -> None:
+    scene = make_scene(np.random.default_rng(10), max(n, 1))
+    with pytest.raises(DegenerateMotionError, match=message):
+        calibrate(scene, scene.before[:n], scene.after[:n], axis="normal", **options)
+
+
+def test_right_angle_at_an_end_of_the_axis_names_the_longest_edge() -> None:
+    right = TriangleRig(0.12, 0.1, np.pi / 2)
+    scene = make_scene(np.random.default_rng(11), 6, "CA", triangle=right)
+    with pytest.raises(
+        DegenerateMotionError, match=r"angle at A.*90\.00.*longest edge BC"
+    ):
+        calibrate(scene)
+    good = make_scene(np.random.default_rng(11), 6, "BC", triangle=right)
+    assert calibrate(good).camera.intrinsics.fx == pytest.approx(1720.0, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("true", "said"), [("normal", "CA"), ("CA", "normal"), ("AB", "BC")]
+)
+def test_wrong_axis_is_no_half_turn(true, said) -> None:
+    scene = make_scene(np.random.default_rng(12), 6, true)
+    with pytest.raises(DegenerateMotionError, match="check (the )?axis"):
+        calibrate(scene, axis=said)
+
+
+def test_exchanged_markers_are_no_half_turn() -> None:
+    scene = make_scene(np.random.default_rng(13), 6)
+    after = scene.after.copy()
+    after[4] = after[4, [1, 0, 2]]
+    with pytest.raises(DegenerateMotionError, match="half-turn 4 is no half-turn"):
+        calibrate(scene, after=after, o="free")
+
+
+def test_views_too_weak_for_the_noise_are_refused_with_sigma() -> None:
+    rng = np.random.default_rng([14, 0])
+    scene = make_scene(rng, 3, tilt_deg=(2.0, 5.0), azimuths=[0.0, 2.0, 4.0])
+    with pytest.raises(DegenerateMotionError, match="predicted sigma of"):
+        calibrate(scene, *scene.noisy(rng, 0.4), sigma_px=0.4)
+
+
+def test_closed_form_that_is_no_camera_is_an_error_and_refinement_survives_it() -> None:
+    failures = 0
+    for seed in range(60):
+        rng = np.random.default_rng([15, seed])
+        scene = make_scene(rng, 3, tilt_deg=(15, 25))
+        seen = scene.noisy(rng, 3.0)
+        try:
+            calibrate(scene, *seen, sigma_px=3.0, refine=False)
+        except DegenerateMotionError as error:
+            if "not positive definite" not in str(error):
+                continue
+            failures += 1
+            try:
+                result = calibrate(scene, *seen, sigma_px=3.0)
+            except HandEyeError:
+                continue
+            assert result.details["start"] == "generic"
+    assert failures > 0
+
+
+def broken(change):
+    scene = make_scene(np.random.default_rng(16), 5)
+    before, after = scene.before.copy(), scene.after.copy()
+    options = change(before, after) or {}
+    return scene, options.pop("before", before), options.pop("after", after), options
+
+
+def nothing_found(before, after):
+    before[:, 1] = np.nan
+
+
+def outside(before, after):
+    after[3, 2] = (1030.0, 20.0)
+
+
+def coincide(before, after):
+    before[2, 1] = before[2, 0]
+
+
+def unturned(before, after):
+    after[1] = before[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (nothing_found, InputError, "none of the 5 half-turns"),
+        (outside, InputError, r"marker C after half-turn 3 lies at \(1030.0, 20.0\)"),
+        (coincide, DegenerateMotionError, "markers A and B before half-turn 2"),
+        (unturned, DegenerateMotionError, "half-turn 1 about 'normal' moved"),
+        (
+            lambda b, a: {"before": b[0]},
+            InputError,
+            r"before must have shape \(n, 3, 2\)",
+        ),
+        (lambda b, a: {"after": a[:4]}, InputError, "5 views before and 4 after"),
+        (lambda b, a: {"axis": "AC"}, InputError, "axis must be one of.*'AC'"),
+        (lambda b, a: {"axis": ("AB", "BC")}, InputError, "got 2 for 5"),
+        (lambda b, a: {"sigma_px": 0.0}, InputError, "sigma_px must be a positive"),
+        (lambda b, a: {"covariance": np.eye(2)}, InputError, r"covariance must have"),
+        (
+            lambda b, a: {"covariance": np.tile(-np.eye(2), (5, 2, 3, 1, 1))},
+            InputError,
+            "marker A before half-turn 0 is not symmetric and positive",
+        ),
+        (
+            lambda b, a: {
+                "sigma_px": 1.0,
+                "covariance": np.tile(np.eye(2), (5, 2, 3, 1, 1)),
+            },
+            InputError,
+            "either sigma_px or covariance",
+        ),
+        (lambda b, a: {"o": "fixed"}, InputError, "o must be"),
+        (lambda b, a: {"o": (1.0, 2.0, 3.0)}, InputError, r"shape \(2,\)"),
+        (lambda b, a: {"distortion": "fisheye"}, InputError, "'fisheye'"),
+        (lambda b, a: {"distortion": ("k1", "k9")}, InputError, "k9"),
+        (lambda b, a: {"method": "best"}, InputError, "'best'"),
+        (lambda b, a: {"turn_covariance": np.eye(6)}, InputError, "needs sigma_px"),
+        (
+            lambda b, a: {"turn_covariance": -np.eye(6), "sigma_px": 1.0},
+            InputError,
+            "positive semi-definite",
+        ),
+        (
+            lambda b, a: {"turn_covariance": np.eye(3), "sigma_px": 1.0},
+            InputError,
+            r"shape \(6, 6\)",
+        ),
+        (
+            lambda b, a: {"distortion": ("k1",), "refine": False},
+            InputError,
+            "need refine=True",
+        ),
+    ],
+)
+def test_bad_input_is_named(change, error, message) -> None:
+    scene, before, after, options = broken(change)
+    with pytest.raises(error, match=message):
+        calibrate(scene, before, after, **options)
+
+
+def test_wrong_image_size_is_refused() -> None:
+    scene = make_scene(np.random.default_rng(17), 5)
+    with pytest.raises(InputError, match="outside the 100 x 80 image"):
+        calibrate_camera(scene.before, scene.after, TRIANGLE, image_size=(100, 80))
+    with pytest.raises(InputError, match="image_size must be"):
+        calibrate_camera(scene.before, scene.after, TRIANGLE, image_size=(0, 80))
