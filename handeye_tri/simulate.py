@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,6 +48,7 @@ _MISSING_GL = (
 )
 # Names of random streams, so that none is used twice.
 _ROBOT_STREAM, _SENSOR_STREAM = 101, 102
+_SETTINGS = ("option", "visual", "stat", "memory", "nkey")
 # Solid and drawn.
 _SOLID = {"contype": 1, "conaffinity": 1, "group": 0}
 _CELL = "cell"
@@ -91,7 +93,11 @@ def _compile(cell: Cell, model_path: Path) -> tuple[Any, Mechanism]:
     arm = _load(mujoco, model_path)
     frames = find_frames(cell, model_path, _compile_spec(arm, model_path))
     spec = mujoco.MjSpec()
+    _accept_any_mass(spec)
     _set_scene(mujoco, spec)
+    # The cell's settings of physics and drawing hold; MuJoCo warns where they differ.
+    for setting in (*_SETTINGS, *(name for name in dir(spec) if "nuser_" in name)):
+        setattr(arm, setting, getattr(spec, setting))
     # The arm's own world becomes this body, so that it moves as one.
     stand = spec.worldbody.add_body(
         name=STAND, pos=np.array(cell.arm.position_m) - frames.base_position
@@ -121,9 +127,17 @@ def _load(mujoco: Any, path: Path) -> Any:
         ) from None
     spec.compiler.fusestatic = False
     spec.compiler.discardvisual = False
+    _accept_any_mass(spec)
     for light in list(spec.lights):
         spec.delete(light)
     return spec
+
+
+def _accept_any_mass(spec: Any) -> None:
+    """Masses play no part here; models that lack them are welcome."""
+    spec.compiler.boundmass = 1e-6
+    spec.compiler.boundinertia = 1e-9
+    spec.compiler.balanceinertia = True
 
 
 def _compile_spec(spec: Any, path: Path) -> Any:
@@ -306,8 +320,10 @@ def check_rendering() -> None:
 
 
 @contextmanager
-def _canvas(mujoco: Any, model: Any, width: int, height: int) -> Iterator[Any]:
-    """An off-screen picture of a size; yields what the renderer draws with.
+def _canvas(
+    mujoco: Any, model: Any, width: int, height: int
+) -> Iterator[tuple[Any, Any]]:
+    """An off-screen picture; yields its OpenGL context and MuJoCo's.
 
     Raises:
         MissingDependencyError: OpenGL is absent or fails.
@@ -326,8 +342,9 @@ def _canvas(mujoco: Any, model: Any, width: int, height: int) -> Iterator[Any]:
             raise MissingDependencyError(_MISSING_GL.format(_one_line(error))) from None
         try:
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, painter)
-            yield painter
+            yield context, painter
         finally:
+            context.make_current()
             painter.free()
     finally:
         context.free()
@@ -396,20 +413,44 @@ def render_views(
     options.sitegroup[:] = 0
     for flag in ("SHADOW", "REFLECTION"):
         scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = 0
-    with _canvas(mujoco, model, *(int(x) for x in sizes.max(axis=0))) as painter:
-        for i, j in wanted:
-            data.qpos[:] = model.qpos0
-            data.qpos[order] = q[j]
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_camlight(model, data)
-            mujoco.mjv_updateScene(
-                model, data, options, None, eyes[i], mujoco.mjtCatBit.mjCAT_ALL, scene
-            )
-            width, height = (int(x) for x in sizes[i])
-            area = mujoco.MjrRect(0, 0, width, height)
-            picture = np.empty((height, width, 3), dtype=np.uint8)
-            mujoco.mjr_render(area, scene, painter)
-            mujoco.mjr_readPixels(picture, None, area, painter)
-            rng = np.random.default_rng([seed, _SENSOR_STREAM, i, j])
-            # OpenGL's first row is the lowest.
-            yield i, j, develop(optics[i], cell.imaging, picture[::-1], rng)
+
+    def draw(view: tuple[int, int]) -> Image:
+        i, j = view
+        data.qpos[:] = model.qpos0
+        data.qpos[order] = q[j]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        mujoco.mjv_updateScene(
+            model, data, options, None, eyes[i], mujoco.mjtCatBit.mjCAT_ALL, scene
+        )
+        width, height = (int(x) for x in sizes[i])
+        area = mujoco.MjrRect(0, 0, width, height)
+        picture = np.empty((height, width, 3), dtype=np.uint8)
+        # Whoever takes the images may draw with OpenGL in between.
+        context.make_current()
+        mujoco.mjr_render(area, scene, painter)
+        mujoco.mjr_readPixels(picture, None, area, painter)
+        # OpenGL's first row is the lowest.
+        return picture[::-1]
+
+    def finish(view: tuple[int, int], picture: Image) -> tuple[int, int, Image]:
+        i, j = view
+        rng = np.random.default_rng([seed, _SENSOR_STREAM, i, j])
+        return i, j, develop(optics[i], cell.imaging, picture, rng)
+
+    # One view is finished while the next is drawn.
+    with (
+        _canvas(mujoco, model, *(int(x) for x in sizes.max(axis=0))) as (
+            context,
+            painter,
+        ),
+        ThreadPoolExecutor(1) as worker,
+    ):
+        pending: Future[tuple[int, int, Image]] | None = None
+        for view in wanted:
+            picture = draw(view)
+            if pending is not None:
+                yield pending.result()
+            pending = worker.submit(finish, view, picture)
+        if pending is not None:
+            yield pending.result()
