@@ -1,0 +1,126 @@
+"""The three markers in an image, with a covariance for each centre."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.detect import search
+from handeye_tri.detect.identity import assign
+from handeye_tri.detect.markers import Detection, MarkerSpec, Reason, chroma
+from handeye_tri.detect.outline import Indices, Outlines, measure
+from handeye_tri.errors import InputError
+from handeye_tri.records import Floats
+
+__all__ = ["Detection", "MarkerSpec", "detect_markers"]
+
+_MIN_SIDE = 32
+
+
+def detect_markers(image: NDArray[np.uint8], markers: MarkerSpec) -> Detection:
+    """Find the balls A, B, C in one image.
+
+    The pixel of a marker is the centre of its outline's ellipse, which is not the
+    image of the ball's centre. Nothing is known but the image: no earlier view, no
+    pose.
+
+    Args:
+        image: RGB, shape (h, w, 3), or grey, shape (h, w), 8 bits.
+        markers: What they look like. Identity by colour needs an RGB image;
+            identity by radius takes either.
+
+    Raises:
+        InputError: the image is not of this kind.
+    """
+    _check(image, markers)
+    if markers.identity == "colour":
+        spots = search.coloured_spots(image, markers)
+        hues = chroma(markers.colours)
+        # The part of the marker's colour, blind to every grey: 255 is all of it.
+        weights = hues / (hues**2).sum(axis=1, keepdims=True)
+        weights = weights[[spot.markers[0] for spot in spots]]
+    else:
+        if image.ndim == 3:
+            image = search.grey(image)
+        spots = search.flat_spots(image)
+        weights = None
+    if not spots:
+        return _detection(None, (), [None] * 3, unclear=False)
+
+    def sampler(points: Floats) -> Floats:
+        values = search.sample(image, points)
+        if weights is None:
+            return values
+        return np.asarray(np.einsum("mrsc,mc->mrs", values, weights))
+
+    def reader(spot: Indices, row: Indices, column: Indices) -> Floats:
+        values = image[row, column].astype(float)
+        if weights is None:
+            return values
+        return np.asarray((values * weights[spot]).sum(axis=1))
+
+    outlines = measure(
+        sampler,
+        reader,
+        (image.shape[1], image.shape[0]),
+        np.array([spot.centre for spot in spots]),
+        np.array([spot.radius for spot in spots]),
+    )
+    good = [k for k, reason in enumerate(outlines.reasons) if reason is None]
+    chosen, unclear = assign(
+        [spots[k].markers for k in good], outlines.radii[good], markers.radii
+    )
+    named = [None if k is None else good[k] for k in chosen]
+    return _detection(outlines, tuple(s.markers for s in spots), named, unclear=unclear)
+
+
+def _check(image: NDArray[np.uint8], markers: MarkerSpec) -> None:
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+        kind = getattr(image, "dtype", type(image).__name__)
+        raise InputError(f"image must be an array of uint8, got {kind}")
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise InputError(
+            f"image must have shape (h, w, 3) or (h, w), got {image.shape}"
+        )
+    if min(image.shape[:2]) < _MIN_SIDE:
+        raise InputError(
+            f"image must have at least {_MIN_SIDE} rows and columns, got {image.shape}"
+        )
+    if image.ndim == 2 and markers.identity == "colour":
+        raise InputError(
+            "the image is grey but the markers are told apart by colour; take RGB "
+            'images, or use balls of three sizes and identity "radius"'
+        )
+
+
+def _detection(
+    outlines: Outlines | None,
+    allowed: tuple[tuple[int, ...], ...],
+    named: list[int | None],
+    *,
+    unclear: bool,
+) -> Detection:
+    pixels = np.full((3, 2), np.nan)
+    covariance = np.full((3, 2, 2), np.nan)
+    radii = np.full(3, np.nan)
+    reasons: list[Reason | None] = []
+    for marker, spot in enumerate(named):
+        if spot is not None and outlines is not None:
+            pixels[marker] = outlines.centres[spot]
+            covariance[marker] = outlines.covariance[spot]
+            radii[marker] = outlines.radii[spot]
+            reasons.append(None)
+        elif unclear:
+            reasons.append("ambiguous")
+        else:
+            own = (
+                [
+                    reason
+                    for may, reason in zip(allowed, outlines.reasons, strict=True)
+                    if reason is not None and marker in may
+                ]
+                if outlines is not None
+                else []
+            )
+            reasons.append(own[0] if own else "no_candidate")
+    return Detection(pixels, covariance, radii, tuple(reasons))
