@@ -11,7 +11,7 @@ from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.hand_eye.degeneracy import require_determined
 from handeye_tri.hand_eye.motions import check_pairs
 from handeye_tri.hand_eye.refine import Refinement, refine_axzb
-from handeye_tri.se3 import SE3, nearest_rotation, se3_inverse
+from handeye_tri.se3 import SE3, nearest_rotation
 
 Floats = NDArray[np.float64]
 AbsoluteMethod = Literal["shah", "li", "refined"]
@@ -113,21 +113,23 @@ def _shah(a: Floats, b: Floats) -> tuple[SE3, SE3]:
     motions, so no pair's information is lost although the cost is linear.
     """
     n = len(a)
-    ra, rb = a[:, :3, :3], b[:, :3, :3]
+    ra, rb = (np.ascontiguousarray(m[:, :3, :3]) for m in (a, b))
     kronecker = (ra.reshape(n, 9).T @ rb.reshape(n, 9)).reshape(3, 3, 3, 3)
     total = kronecker.transpose(0, 2, 1, 3).reshape(9, 9) / n
     u, values, vt = np.linalg.svd(total)
-    require_determined(values[0], values[1], a[1:] @ se3_inverse(a[:-1]))
+    require_determined(values[0], values[1], ra[:-1], ra[1:])
     entries = vt[0].reshape(3, 3)
     sign = np.sign(np.linalg.det(entries))
     x = nearest_rotation(sign * entries)
     z = nearest_rotation(sign * u[:, 0].reshape(3, 3))
-    # R_A t_X - t_Z = R_Z t_B - t_A; t_Z leaves with the means.
+    # R_A t_X - t_Z = R_Z t_B - t_A =: r. Its normal equations need means alone, since
+    # R_A'R_A = I: t_Z = M t_X - mean r, (I - M'M) t_X = mean R_A'r - M' mean r.
     right = b[:, :3, 3] @ z.T - a[:, :3, 3]
     mean_ra, mean_right = ra.mean(axis=0), right.mean(axis=0)
-    t_x = np.linalg.lstsq(
-        (ra - mean_ra).reshape(-1, 3), (right - mean_right).reshape(-1), rcond=None
-    )[0]
+    turned = ra.reshape(3 * n, 3).T @ right.reshape(3 * n) / n
+    t_x = np.linalg.solve(
+        np.eye(3) - mean_ra.T @ mean_ra, turned - mean_ra.T @ mean_right
+    )
     return SE3.from_parts(x, t_x), SE3.from_parts(z, mean_ra @ t_x - mean_right)
 
 

@@ -35,6 +35,8 @@ _MIN_RATIO = 4.0
 # are all half-turns within the first angle must have axes out of plane by the second.
 _HALF_TURN = np.radians(179.0)
 _OUT_OF_PLANE = np.radians(2.0)
+_HALF_TURN_TRACE = 1.0 + 2.0 * np.cos(_HALF_TURN)
+_NO_TURN_TRACE = 1.0 + 2.0 * np.cos(np.radians(18.0))
 
 
 def residual_angle(agreement: float) -> float:
@@ -47,20 +49,28 @@ def residual_angle(agreement: float) -> float:
     return float(np.sqrt(3.0 * max(1.0 - agreement, 0.0)))
 
 
-def require_determined(best: float, next_best: float, motions: Floats) -> None:
+def require_determined(
+    best: float, next_best: float, first: Floats, second: Floats
+) -> None:
     """Refuse motions that do not determine the rotation.
 
     Args:
         best: Agreement of the best solution, at most 1.
         next_best: Agreement of the next best.
-        motions: The relative motions, or for absolute poses the successive ones,
-            shape (n, 4, 4).
+        first: Rotations before each motion, shape (n, 3, 3) or (1, 3, 3).
+        second: Rotations after it, shape (n, 3, 3). Successive poses will do, since
+            their motions generate all others.
 
     Raises:
         DegenerateMotionError: see the module; the message has the numbers.
     """
     reached, other = residual_angle(best), residual_angle(next_best)
-    vectors = so3_log(motions[:, :3, :3])
+    distinct = other > max(_MIN_ANGLE, _MIN_RATIO * reached)
+    # Cheaper than angles: the trace of a rotation is 1 + 2 cos(angle).
+    trace = np.einsum("nab,nab->n", *np.broadcast_arrays(first, second))
+    if distinct and ((trace > _HALF_TURN_TRACE) & (trace < _NO_TURN_TRACE)).any():
+        return
+    vectors = so3_log(second @ np.swapaxes(first, 1, 2))
     angles = np.linalg.norm(vectors, axis=1)
     turning = angles >= 0.1 * angles.max()
     axes = vectors[turning] / np.maximum(angles[turning, None], 1e-300)
@@ -69,7 +79,7 @@ def require_determined(best: float, next_best: float, motions: Floats) -> None:
     out_of_plane, off_line = np.sqrt(np.maximum([spread[0], spread[:2].sum()], 0.0))
     half_turns = bool(angles[turning].min() > _HALF_TURN)
     flat = half_turns and out_of_plane < np.sin(_OUT_OF_PLANE)
-    if other > max(_MIN_ANGLE, _MIN_RATIO * reached) and not flat:
+    if distinct and not flat:
         return
     numbers = (
         f"the best solution leaves {np.degrees(reached):.3g} degrees RMS and a "

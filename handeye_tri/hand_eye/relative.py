@@ -87,7 +87,7 @@ def _linear_rotation(a: Floats, b: Floats) -> Floats:
     )
     total = kronecker.transpose(0, 2, 1, 3).reshape(9, 9) / n
     values, vectors = np.linalg.eigh(0.5 * (total + total.T))
-    require_determined(values[-1], values[-2], a)
+    require_determined(values[-1], values[-2], np.eye(3)[None], a[:, :3, :3])
     entries = vectors[:, -1].reshape(3, 3)
     return nearest_rotation(entries * np.sign(np.linalg.det(entries)))
 

@@ -1,7 +1,6 @@
 """AX = ZB: exact data, half-turns, weights, covariance, cost, degenerate poses."""
 
 import json
-import time
 from pathlib import Path
 
 import numpy as np
@@ -194,19 +193,15 @@ def test_li_refuses_what_has_no_scale():
 
 
 @pytest.mark.parametrize("method", ABSOLUTE_METHODS)
-def test_cost_and_accuracy_hold_to_many_poses(method):
-    # A quadratic method would take a hundred times longer for ten times the poses.
+def test_many_poses_are_no_special_case(method):
+    # More than two of the chunks in which the joint system is factorised; all pairs
+    # of so many poses would not fit into memory.
     rng = np.random.default_rng(13)
     x, z = random_poses(rng, 2)
-    times = []
-    for n in (3000, 30000):
-        a = random_poses(rng, n)
-        b = se3_inverse(z) @ a @ x
-        begin = time.process_time()
-        found = solve_axzb(a, b, method=method)[1]
-        times.append(time.process_time() - begin)
-        np.testing.assert_allclose(found.matrix, z, atol=1e-12)
-    assert times[1] < 40 * times[0]
+    a = random_poses(rng, 10000)
+    found = solve_axzb(a, se3_inverse(z) @ a @ x, method=method)
+    np.testing.assert_allclose(found[0].matrix, x, atol=1e-12)
+    np.testing.assert_allclose(found[1].matrix, z, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -228,7 +228,7 @@ def test_unknown_method_is_named_with_the_known_ones():
 
 def test_two_half_turns_are_refused_however_well_they_fit():
     # With 1 degree of noise some pairs fit each other by chance: the ratio of the two
-    # residuals alone would let 1 in 20 through.
+    # residuals alone would let 1 in 50 through.
     sigma = np.repeat([1e-3, np.radians(1.0)], 3)
     for seed in range(50):
         rng = np.random.default_rng([14, seed])
