@@ -243,7 +243,7 @@ def doctor() -> None:
         click.echo(f"{mark}  {check.name:<18} {check.found}")
         if not check.ok:
             click.echo(f"         {check.remedy}")
-    sys.exit(0 if all(check.ok for check in checks) else 2)
+    sys.exit(0 if all(check.ok or check.optional for check in checks) else 2)
 
 
 def _log_bug() -> Path:

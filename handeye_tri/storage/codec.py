@@ -25,7 +25,7 @@ Json = dict[str, Any]
 
 
 def numbers(array: NDArray[np.float64]) -> Any:
-    """Nested lists of an array; NaN becomes null."""
+    """Nested lists of an array of any shape; NaN becomes null."""
     if np.isfinite(array).all():
         return array.tolist()
     boxed = array.astype(object)
@@ -150,7 +150,7 @@ def plan_from_json(data: Mapping[str, Any]) -> Plan:
 
 
 def truth_to_json(truth: GroundTruth, joints: NDArray[np.float64]) -> Json:
-    """What the simulation knows, with the joints it executed."""
+    """What the simulation knows, with the joints it executed, shape (n, q)."""
     return {
         "cameras": [camera_to_json(camera) for camera in truth.cameras],
         "base_from_camera": [
