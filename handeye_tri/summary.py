@@ -15,7 +15,6 @@ from handeye_tri.records import GroundTruth, HandEyeCalibration, motion_labels
 from handeye_tri.se3 import SE3, so3_left_jacobian_inverse, so3_log
 
 Floats = NDArray[np.float64]
-_WIDTH = 88
 
 
 def digits(sigma: float) -> int:
@@ -66,11 +65,11 @@ def _verdict(evaluation: Mapping[str, Any]) -> list[str]:
         f"  {track['max_mm']:.3f} worst (station {track['worst_station']}, "
         f"marker {track['worst_marker']}).",
         f"  Nearest to failing: {evaluation['nearest']}.",
-        f"  {'gate':<29}{'found':<16}{'limit':<17}{'verdict':<10}blind to",
+        f"  {'gate':<32}{'found':<16}{'limit':<16}{'verdict':<10}blind to",
     ]
     for number, gate in enumerate(gates, 1):
         lines.append(
-            f"  {number} {gate['name']:<27}{gate['found']:<16}{gate['limit']:<17}"
+            f"  {number} {gate['name']:<30}{gate['found']:<16}{gate['limit']:<16}"
             f"{gate['verdict']:<10}{gate['blind_to']}"
         )
     for finding in evaluation["findings"]:
@@ -78,7 +77,7 @@ def _verdict(evaluation: Mapping[str, Any]) -> list[str]:
             f"  {finding['code']}: {finding['cause']}; {finding['evidence']}",
             f"    Do: {finding['remedy']}.",
         ]
-    return [line[:_WIDTH] if line.lstrip()[:1].isdigit() else line for line in lines]
+    return lines
 
 
 def _result(rows: Sequence[Mapping[str, Any]]) -> list[str]:
