@@ -10,13 +10,14 @@ import time
 from pathlib import Path
 
 import numpy as np
-from ruamel.yaml import YAML
+
 
 from handeye_tri.arm import Arm
-from handeye_tri.config import parse_cell
+
 from handeye_tri.errors import NoPlanError
 from handeye_tri.plan import plan_motions
 from handeye_tri.simulate import compile_mechanism
+from handeye_tri.storage.cells import read_cell
 
 REPO = Path(__file__).resolve().parent.parent
 
@@ -33,7 +34,7 @@ def main() -> None:
     )
     for name in names:
         path = REPO / "scenes" / f"{name}.yaml"
-        cell = parse_cell(YAML(typ="safe").load(path.read_text()), str(path))
+        cell = read_cell(path)
         arm = Arm(compile_mechanism(cell, REPO / "robot_models" / cell.arm.model))
         seconds, spreads, track, failures = [], [], [], []
         for seed in range(1, asked.seeds + 1):

@@ -1,5 +1,5 @@
 """Stations for a calibration: half-turns joined by general motions."""
 
-from handeye_tri.plan.motions import plan_motions
+from handeye_tri.plan.programme import plan_motions
 
 __all__ = ["plan_motions"]

@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 _BATCH = 120
 _MOST_POSES = 3600
 # A cell in which none of this many poses passes has no plan.
-_HOPELESS = 1800
+_HOPELESS = 1200
 # Inverse solutions of a pose that are tried, nearest to those before first.
 _SOLUTIONS = 4
 _STARTS = 12
@@ -122,34 +122,45 @@ class CandidateSearch:
             if len(joints) == 0:
                 self.rejected["limits" if beyond else "reach"] += 1
             else:
-                solved.append((joints, self._turned(joints) if turns else []))
+                solved.append(joints)
         if not turns:
-            return solved
-        possible = [s for s in solved if any(len(after) for after in s[1])]
-        self.rejected["half_turn"] += len(solved) - len(possible)
+            return [(joints, []) for joints in solved]
+        pairs = list(zip(solved, self._turned(solved), strict=True))
+        possible = [pair for pair in pairs if any(len(after) for after in pair[1])]
+        self.rejected["half_turn"] += len(pairs) - len(possible)
         return possible
 
-    def _turned(self, joints: Floats) -> list[Floats]:
-        """Joints after the half-turn, for each solution (s, q) before it.
+    def _turned(self, poses: list[Floats]) -> list[list[Floats]]:
+        """Joints after the half-turn, for each solution (s, q) of each pose.
 
-        The last joint turns where its axis is the flange's; otherwise inverse
-        kinematics, and the solution nearest to the one before.
+        The last joint turns where its axis is the flange's and its limits allow;
+        otherwise inverse kinematics, and the solution nearest to the one before.
         """
         arm = self._arm
-        target = arm.forward(joints) @ HALF_TURN
+        result = [self._by_last_joint(joints) for joints in poses]
+        missing = [k for k, after in enumerate(result) if not any(map(len, after))]
+        if missing:
+            targets = np.array([arm.forward(poses[k][0]) @ HALF_TURN for k in missing])
+            found = arm.inverse(targets, self._rng, starts=_STARTS).joints
+            for k, others in zip(missing, found, strict=True):
+                result[k] = [
+                    others[np.argsort(np.linalg.norm(others - q, axis=1))[:1]]
+                    for q in poses[k]
+                ]
+        return result
+
+    def _by_last_joint(self, joints: Floats) -> list[Floats]:
+        """The last joint turned by pi either way, where that is a half-turn."""
+        arm = self._arm
         tries = np.repeat(joints[:, None], 2, axis=1)
         tries[..., -1] += (-np.pi, np.pi)
-        off = np.abs(arm.forward(tries) - target[:, None]).max(axis=(-1, -2))
-        exact = off < _SAME_POSE
+        target = arm.forward(joints)[:, None] @ HALF_TURN
+        off = np.abs(arm.forward(tries) - target).max(axis=(-1, -2))
         inside = ((tries >= arm.lower) & (tries <= arm.upper)).all(axis=-1)
-        if exact.any():
-            return [
-                turned[keep][np.argsort(np.abs(turned[keep][:, -1]), kind="stable")]
-                for turned, keep in zip(tries, exact & inside, strict=True)
-            ]
-        others = arm.inverse(target[0], self._rng, starts=_STARTS).joints[0]
+        usable = (off < _SAME_POSE) & inside
         return [
-            others[np.argsort(np.linalg.norm(others - q, axis=1))[:1]] for q in joints
+            turned[keep][np.argsort(np.abs(turned[keep][:, -1]), kind="stable")]
+            for turned, keep in zip(tries, usable, strict=True)
         ]
 
     def _first_free(self, before: Floats, after: list[Floats]) -> Candidate | None:

@@ -18,7 +18,7 @@ HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 _MIN_TILT = np.radians(8.0)
 # An edge rig's holder comes from behind where the flange axis is lifted this far
 # from the image plane towards the cameras.
-_LIFT = np.radians([2.0, 38.0])
+_LIFT = np.radians([15.0, 50.0])
 _OUTLINE_POINTS = 12
 # A lens model may fold far points back into the image: without its lens, the
 # image extends by at most this part of its size.

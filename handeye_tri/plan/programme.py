@@ -14,7 +14,7 @@ from handeye_tri.errors import InputError, NoPlanError
 from handeye_tri.plan.candidates import Candidate, CandidateSearch
 from handeye_tri.plan.information import StationInformation, choose
 from handeye_tri.plan.poses import View, plane_angles
-from handeye_tri.records import HalfTurn, Plan, Repeatability, Station
+from handeye_tri.records import HalfTurn, Plan, Station
 from handeye_tri.se3 import SE3, so3_log
 
 Floats = NDArray[np.float64]
@@ -24,9 +24,6 @@ Progress = Callable[[int, int], None]
 EXPECTED_SIGMA_PX = 0.03
 # Half-turns to choose from, per half-turn wanted.
 _POOL = 8
-# The information is computed for a robot this much worse than stated: a plan shall
-# hold where cameras are calibrated before, and without, the robot's poses.
-_ROBOT_DOUBT = 10.0
 # Orders and selections that are tried before a cell is given up.
 _PATHS = 150
 _SELECTIONS = 6
@@ -142,18 +139,16 @@ class _Planner:
         self._done(self.total)
         return self._record(chosen, evaluation, len(pool))
 
-    def _information(self, repeatability: Repeatability) -> StationInformation:
+    def _information(self) -> StationInformation:
         return StationInformation(
-            self.view, self.arm.base_from_world.matrix, repeatability, EXPECTED_SIGMA_PX
+            self.view,
+            self.arm.base_from_world.matrix,
+            self.cell.repeatability,
+            EXPECTED_SIGMA_PX,
         )
 
     def _choose_and_order(self, pool: list[Candidate]) -> list[Candidate]:
-        stated = self.cell.repeatability
-        doubted = Repeatability(
-            max(_ROBOT_DOUBT * stated.translation, 1e-6),
-            max(_ROBOT_DOUBT * stated.rotation, 1e-6),
-        )
-        model = self._information(doubted)
+        model = self._information()
         poses = np.array([c.base_from_flange for c in pool])
         information = model.of_stations(poses.reshape(-1, 4, 4))
         size = len(model.labels)
@@ -305,7 +300,7 @@ class _Planner:
             "axis_spread": _axis_spread(poses[:, :3, :3]),
             "sigma_px": EXPECTED_SIGMA_PX,
         }
-        model = self._information(self.cell.repeatability)
+        model = self._information()
         covariance = model.covariance(model.of_stations(poses).sum(axis=0))
         for label in covariance.labels:
             owner, quantity = label.rsplit(".", 1)
