@@ -47,7 +47,7 @@ install_packages() {
   if ((${#missing[@]} == 0)); then
     return
   fi
-  if ((EUID != 0)); then
+  if [[ "$(id -u)" != 0 ]]; then
     if ! sudo -n true 2>/dev/null; then
       die "these Debian packages are missing: ${missing[*]}; install them with: sudo apt-get install ${missing[*]}"
     fi
