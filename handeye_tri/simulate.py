@@ -276,7 +276,7 @@ def execute(arm: Arm, plan: Plan, repeatability: Repeatability, seed: int) -> Fl
         InputError: the plan's stations carry no joints of this arm.
     """
     sigma = np.repeat([repeatability.translation, repeatability.rotation], 3)
-    joints = []
+    tangents = []
     for station in plan.stations:
         if station.joints.shape != arm.home.shape:
             raise InputError(
@@ -284,8 +284,9 @@ def execute(arm: Arm, plan: Plan, repeatability: Repeatability, seed: int) -> Fl
                 f"joints, the arm has {arm.home.size}; plan again for this arm"
             )
         rng = np.random.default_rng([seed, _ROBOT_STREAM, station.index])
-        joints.append(arm.perturbed(station.joints, sigma * rng.standard_normal(6)))
-    return np.array(joints)
+        tangents.append(sigma * rng.standard_normal(6))
+    commanded = np.array([station.joints for station in plan.stations])
+    return arm.perturbed(commanded, tangents)
 
 
 def ground_truth(cell: Cell, arm: Arm, joints: ArrayLike) -> GroundTruth:
