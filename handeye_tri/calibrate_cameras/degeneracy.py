@@ -123,13 +123,6 @@ def plane_spread_deg(normals: Floats) -> float:
     return float(np.degrees(np.arccos(min(cosine, 1.0))))
 
 
-def nominal_normals(homographies: Homographies) -> Floats:
-    """Unit plane normals as a nominal camera sees them, shape (n, 3)."""
-    line, _ = vanishing_lines(homographies)
-    normals = np.concatenate([NOMINAL_FOCAL * line, np.ones((len(line), 1))], axis=1)
-    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
-
-
 def check_planes(homographies: Homographies, noise_known: bool) -> None:
     """Refuse planes that cannot be told from parallel ones (Proposition 1).
 
@@ -146,9 +139,11 @@ def check_planes(homographies: Homographies, noise_known: bool) -> None:
     Raises:
         DegenerateMotionError: says the spread and the tilt, in degrees.
     """
-    normals = nominal_normals(homographies)
-    spread = plane_spread_deg(normals)
     line, covariance = vanishing_lines(homographies)
+    # Normals as a nominal camera sees them: K is not known yet.
+    normals = np.concatenate([NOMINAL_FOCAL * line, np.ones((len(line), 1))], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    spread = plane_spread_deg(normals)
     if not noise_known:
         covariance = covariance * (homographies.chi2 / homographies.dof)
     covariance = covariance + np.eye(2) * 1e-18

@@ -27,6 +27,7 @@ class HalfTurnData:
         pixels: Shape (n, 2, 3, 2): half-turn, before and after, A B C, column row.
         whitener: Shape (n, 2, 3, 2, 2): W with W'W the inverse pixel covariance.
         triangle: The rig.
+        points: Its A, B, C, shape (3, 3), metres.
         axes: The axis of each half-turn.
         rotation: Rotation of each half-turn in the triangle's frame, (n, 3, 3).
         offset: Its translation where O is the origin, shape (n, 3), metres.
@@ -38,6 +39,7 @@ class HalfTurnData:
     pixels: Floats
     whitener: Floats
     triangle: TriangleRig
+    points: Floats
     axes: tuple[Axis, ...]
     rotation: Floats
     offset: Floats
@@ -109,6 +111,7 @@ def read_half_turns(
         pixels[used],
         whitener[used],
         triangle,
+        triangle.points,
         kept,
         np.array([motions[name].rotation for name in kept]).reshape(-1, 3, 3),
         np.array([motions[name].translation for name in kept]).reshape(-1, 3),

@@ -88,7 +88,7 @@ class HalfTurnModel:
         if turn_covariance is not None:
             values, vectors = np.linalg.eigh(turn_covariance)
             self.turn_root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-        self._hat_points = hat(data.triangle.points)
+        self._hat_points = hat(data.points)
 
     @property
     def camera_unknowns(self) -> int:
@@ -125,7 +125,7 @@ class HalfTurnModel:
         second order, 1e-9 m at 0.03 mm and 0.005 degrees.
         """
         data = self.data
-        points = data.triangle.points
+        points = data.points
         rotation, offset = data.rotation[:, None], data.translation(state.o)[:, None]
         if self.turn_root is None:
             return points @ np.swapaxes(data.rotation, -1, -2) + offset, None
@@ -156,7 +156,7 @@ class HalfTurnModel:
     def _in_camera(self, state: State, turned: Floats) -> tuple[Floats, Floats]:
         """Markers before and after, (n, 2, 3, 3): triangle's frame, camera frame."""
         points = np.empty((len(self.data), 2, 3, 3))
-        points[:, 0] = self.data.triangle.points
+        points[:, 0] = self.data.points
         points[:, 1] = turned
         rotation = np.swapaxes(state.poses[:, None, :3, :3], -1, -2)
         return points, points @ rotation + state.poses[:, None, None, :3, 3]

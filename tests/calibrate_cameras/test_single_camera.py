@@ -146,7 +146,7 @@ def statistics(scene, sigma, trials, seed, truth=None, **options):
 @pytest.mark.parametrize("sigma", [0.1, 1.0])
 def test_reaches_the_cramer_rao_bound_and_says_its_spread(axis, sigma) -> None:
     scene = make_scene(np.random.default_rng(9), 11, axis)
-    trials = 150
+    trials = 100
     errors, nees, ratio = statistics(scene, sigma, trials, 10)
     bound = np.sqrt(np.diagonal(cramer_rao(scene, sigma)))
     # Four standard errors of a root mean square of so many, of NEES, of chi2 / dof;
