@@ -23,7 +23,7 @@ ROWS: tuple[tuple[str, ...], ...] = (
     # Both hand out, or hold their arrays as, records.
     ("mechanism", "config"),
     # Plain numpy below what talks to an engine: arm, simulate.
-    ("kinematics", "imaging", "model_arrays", "rig", "solids"),
+    ("kinematics", "solids"),
     ("storage", "arm", "exchange"),
     ("plan", "synthesize", "simulate", "detect"),
     ("calibrate_cameras",),

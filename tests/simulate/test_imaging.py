@@ -6,7 +6,7 @@ import pytest
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
 from handeye_tri.config import ImagingConfig
 from handeye_tri.errors import InputError
-from handeye_tri.imaging import Optics, blurred, develop
+from handeye_tri.simulate.imaging import Optics, blurred, develop
 
 SIZE = (96, 72)
 PINHOLE = PinholeCamera("a", Intrinsics(160.0, 158.0, 0.0, 49.3, 33.8), SIZE)

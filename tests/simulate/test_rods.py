@@ -7,10 +7,10 @@ import pytest
 
 from handeye_tri.config import RigConfig
 from handeye_tri.errors import InputError
-from handeye_tri.rig import rig_rods
+from handeye_tri.simulate.rods import rig_rods
 from handeye_tri.storage.cells import read_cell
 
-SCENES = Path(__file__).resolve().parent.parent / "scenes"
+SCENES = Path(__file__).resolve().parents[2] / "scenes"
 RODS = {"normal": 7, "edge": 6}
 
 
