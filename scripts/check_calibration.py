@@ -5,6 +5,7 @@ whitened closed form and the paper's closed form; NEES (1: the stated covariance
 true); chi2 / dof. Then the same with a robot whose half-turns miss.
 
     python scripts/check_calibration.py [--trials 1000] [--half-turns 11]
+                                        [--methods refined whitened paper]
 """
 
 from __future__ import annotations
@@ -86,6 +87,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--trials", type=int, default=1000)
     parser.add_argument("--half-turns", type=int, default=11)
+    parser.add_argument(
+        "--methods", nargs="+", choices=list(METHODS), default=list(METHODS)
+    )
     options = parser.parse_args()
     n, trials = options.half_turns, options.trials
     for axis, section in (("normal", "III-A"), ("CA", "III-B")):
@@ -118,9 +122,9 @@ def main() -> None:
                     rng = np.random.default_rng([3, trial])
                     return scene, *scene.noisy(rng, sigma)
 
-                for name, method in METHODS.items():
+                for name in options.methods:
                     errors, nees, ratio, failed, ms = run(
-                        draw, trials, sigma_px=sigma, **method
+                        draw, trials, sigma_px=sigma, **METHODS[name]
                     )
                     rmse = np.sqrt((errors**2).mean(axis=0)) / bound
                     show(

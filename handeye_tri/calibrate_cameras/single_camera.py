@@ -116,7 +116,9 @@ def calibrate_camera(
         The camera. ``residuals`` has shape (1, 2n, 3, 2): half-turns 0 ... n-1 before,
         then 0 ... n-1 after. ``covariance`` has the estimated quantities only.
         ``cost_start`` is chi2 at the closed form, or, where that failed, at the
-        generic start. ``details`` has:
+        generic start. Without ``refine`` chi2 is that of the poses of Sec. III-D,
+        which are no fit to the pixels: only a refined chi2 / dof judges the data.
+        ``details`` has:
 
         - "camera_from_triangle": before each half-turn, (n, 4, 4), metres;
           "camera_from_triangle_after": after it (NaN where left out);
