@@ -140,6 +140,9 @@ def bundle_cameras(
         - "reference_from_triangle": (n, 4, 4), and "station_covariance" of its tangents
           (n, 6, 6), NaN where not used;
         - "used": indices of the stations used; "iterations";
+        - "deviance": -2 log of the restricted likelihood up to a constant, by which
+          values of ``on_axis_correlation`` compare on the same data (Patterson and
+          Thompson 1971, doi:10.1093/biomet/58.3.545);
         - with a covariance in turn_noise, "turn_sigmas": (len(half_turns), 6), the
           deviation of each half-turn over its prior's root, NaN where not used; "axes":
           names of the axes; "triangle_from_axis": (a, 4, 4), they run along its z.

@@ -134,6 +134,7 @@ def bundle_result(
         ),
         "used": np.sort(blocks[present]),
         "iterations": end.iterations,
+        "deviance": _deviance(model, end, information),
     }
     if model.tied:
         details["turn_sigmas"] = _whole(state.turn[: len(members)], members, half_turns)
@@ -153,6 +154,20 @@ def bundle_result(
         + (f", huber {model.huber:g}" if np.isfinite(model.huber) else ""),
         details=details,
     )
+
+
+def _deviance(
+    model: BundleModel, end: Minimum[State, Linearisation], information: Floats
+) -> float:
+    """-2 log of the restricted likelihood, but for what the observations fix."""
+    _, own = np.linalg.slogdet(end.blocks.normal.own)
+    _, shared = np.linalg.slogdet(information)
+    spread = 0.0
+    if model.turns is not None:
+        both = model.seen[:, :, 0] & model.seen[:, :, 1]
+        # Two coordinates of each marker that is seen before and after.
+        spread = 2.0 * float((both * np.log1p(-(model.turns.correlation**2))).sum())
+    return end.cost + spread + float(own.sum() + shared)
 
 
 def _whole(values: Floats, rows: Indices, n: int) -> Floats:

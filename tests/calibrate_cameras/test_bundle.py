@@ -184,13 +184,13 @@ def test_covariance_is_the_dense_inverse(axis, turn_noise, monkeypatch):
 def test_covariance_against_sampling(options, turn_noise):
     geometry = scene(count=2, half_turns=11, **options)
     scores, chi2, dof = [], 0.0, 0
-    for seed in range(60):
+    for seed in range(40):
         session, truth = observe(geometry, seed)
         result = adjust(session, truth, turn_noise=turn_noise, size=0.1)
         scores.append(nees(result, truth))
         chi2, dof = chi2 + result.chi2, dof + result.dof
-    # The mean of 60 trials of 16 or more unknowns spreads by 0.046: 3 of those.
-    assert np.mean(scores) == pytest.approx(1, abs=0.14)
+    # The mean of 40 trials of 16 or more unknowns spreads by 0.056: 3 of those.
+    assert np.mean(scores) == pytest.approx(1, abs=0.17)
     assert chi2 / dof == pytest.approx(1, abs=4 * np.sqrt(2 / dof))
 
 
@@ -199,7 +199,7 @@ def test_correlated_detection_errors_on_the_axis():
     session, truth = observe(geometry, sigma_px=0.0, robot=ROBOT)
     scores = {0.0: [], 0.8: []}
     chi2 = {0.0: 0.0, 0.8: 0.0}
-    for seed in range(50):
+    for seed in range(25):
         rng = np.random.default_rng([seed, 5])
         noise = rng.standard_normal(session.pixels.shape)
         common = rng.standard_normal(session.pixels.shape)
@@ -218,10 +218,11 @@ def test_correlated_detection_errors_on_the_axis():
                 turn_noise=TurnNoise(None, correlation),
             )
             scores[correlation].append(nees(result, truth))
-            chi2[correlation] += result.chi2 / result.dof / 50
-    assert np.mean(scores[0.8]) == pytest.approx(1, abs=0.15)
+            chi2[correlation] += result.chi2 / result.dof / 25
+    # 25 trials of 16 unknowns spread by 0.07, of 116 degrees of freedom by 0.03.
+    assert np.mean(scores[0.8]) == pytest.approx(1, abs=0.21)
     assert np.mean(scores[0.0]) > 1.2, "ignored, it makes the sigmas too small"
-    assert chi2[0.8] == pytest.approx(1, abs=0.05)
+    assert chi2[0.8] == pytest.approx(1, abs=0.09)
 
 
 def test_inexact_half_turns_leave_untied_cameras_alone():

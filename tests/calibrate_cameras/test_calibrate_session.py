@@ -25,7 +25,7 @@ def test_exact_spheres(axis, count):
     sigma = 0.015 * np.sqrt(np.diagonal(result.covariance.matrix))
     np.testing.assert_allclose(errors(result, truth) / sigma, 0, atol=0.01)
     assert len(result.details["separate"]) == count
-    assert np.nanmax(np.abs(result.residuals)) < 1e-5
+    assert np.nanmax(np.abs(result.residuals)) < 1e-4
 
 
 def test_exact_points_with_a_lens():
@@ -57,7 +57,7 @@ def test_what_the_session_asks_for_is_estimated():
 def test_noisy_session_is_as_good_as_it_says():
     scores, chi2, dof = [], 0.0, 0
     gain = []
-    for seed in range(12):
+    for seed in range(8):
         geometry = reference_geometry(np.random.default_rng([seed, 1]))
         session, truth = observe(geometry, seed, marker_radii=RADII)
         result = calibrate_session_cameras(session)
@@ -68,10 +68,40 @@ def test_noisy_session_is_as_good_as_it_says():
             abs(alone.camera.intrinsics.fx - truth.cameras[0].intrinsics.fx)
             / alone.covariance.std("left.fx")
         )
-    # 12 trials of 16 unknowns: the mean score spreads by 0.10, chi2 / dof by 0.04.
-    assert np.mean(scores) == pytest.approx(1, abs=0.3)
+    # 8 trials of 16 unknowns: the mean score spreads by 0.13, chi2 / dof by 0.05.
+    assert np.mean(scores) == pytest.approx(1, abs=0.4)
     assert chi2 / dof == pytest.approx(1, abs=0.15)
     assert np.max(gain) < 3.5
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.75])
+def test_correlation_on_the_axis_is_found(correlation):
+    found = []
+    for seed in range(4):
+        geometry = scene(seed, axis="CA", half_turns=11)
+        exact, _ = observe(geometry, sigma_px=0.0)
+        rng = np.random.default_rng([seed, 8])
+        noise = rng.standard_normal(exact.pixels.shape)
+        common = rng.standard_normal(exact.pixels.shape)
+        for turn in exact.half_turns:
+            for j in (turn.before, turn.after):
+                mine = noise[:, j, [2, 0]] * np.sqrt(1 - correlation)
+                same = common[:, turn.before, [2, 0]] * np.sqrt(correlation)
+                noise[:, j, [2, 0]] = mine + same
+        session = replace(
+            exact,
+            pixels=exact.pixels + 0.015 * noise,
+            pixel_covariance=exact.pixel_covariance * 0.015**2,
+        )
+        result = calibrate_session_cameras(session)
+        found.append(result.details["on_axis_correlation"])
+    # 88 pairs of coordinates, half of them spent on poses: 0.1 to 0.15 each.
+    assert np.mean(found) == pytest.approx(correlation, abs=0.2)
+
+
+def test_no_correlation_where_no_marker_is_on_the_axis():
+    session, _ = observe(scene())
+    assert calibrate_session_cameras(session).details["on_axis_correlation"] == 0
 
 
 def test_separate_stereo_motion_is_kept():
