@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 # A sight line starts this far ahead of the camera centre: a housing whose front
 # face holds the centre is no obstacle.
-_START = 0.01
+_START = 0.001
 # What holds a marker may hide its outline where it lies less than this part of the
 # radius before the outline's plane: 1 % of the radius is covered there.
 _HOLDER_DEPTH = 0.15
@@ -34,11 +34,7 @@ _SIDE = np.concatenate(
 
 
 def coal_shape(geometry: Geometry) -> coal.CollisionGeometry:
-    """The solid in coal; a mesh as its convex hull, as simulators take it.
-
-    Raises:
-        InputError: the shape is not known.
-    """
+    """The solid in coal; a mesh as its convex hull, as simulators take it."""
     size = geometry.size
     match geometry.shape:
         case "box":
@@ -54,14 +50,13 @@ def coal_shape(geometry: Geometry) -> coal.CollisionGeometry:
         case "plane":
             return coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
         case "mesh":
-            model = coal.BVHModelOBBRSS()
-            model.beginModel(len(geometry.faces), len(geometry.vertices))
-            model.addVertices(geometry.vertices)
-            model.addTriangles(geometry.faces)
-            model.endModel()
-            model.buildConvexHull(True, "Qt")
-            return model.convex
-    raise InputError(f"solid {geometry.name!r} has the unknown shape {geometry.shape}")
+            mesh = coal.BVHModelOBBRSS()
+            mesh.beginModel(len(geometry.faces), len(geometry.vertices))
+            mesh.addVertices(geometry.vertices)
+            mesh.addTriangles(geometry.faces)
+            mesh.endModel()
+            mesh.buildConvexHull(True, "Qt")
+            return mesh.convex
 
 
 def bounding_radius(geometry: Geometry) -> float:
@@ -80,7 +75,8 @@ def bounding_radius(geometry: Geometry) -> float:
             return float(size.max())
         case "mesh":
             return float(np.linalg.norm(geometry.vertices, axis=1).max())
-    return float("inf")
+        case "plane":
+            return float("inf")
 
 
 def touch(

@@ -11,9 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-
 from handeye_tri.arm import Arm
-
 from handeye_tri.errors import NoPlanError
 from handeye_tri.plan import plan_motions
 from handeye_tri.simulate import compile_mechanism

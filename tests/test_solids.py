@@ -73,11 +73,6 @@ def test_a_plane_is_solid_below_it():
     assert not touches(plane, (0, 0, 0.011))
 
 
-def test_an_unknown_shape_is_refused():
-    with pytest.raises(InputError, match="'solid' has the unknown shape torus"):
-        coal_shape(geometry("torus", (1.0,)))
-
-
 def test_bounding_balls_hold_their_solids():
     for shape, size, along_x, along_z in EXTENTS:
         assert bounding_radius(geometry(shape, size)) >= max(along_x, along_z)
@@ -120,7 +115,7 @@ def test_the_cone_ends_at_the_outline_and_starts_ahead_of_the_camera(somewhere):
     for depth, hit in (
         (outline + 0.0101, False),
         (outline + 0.0099, True),
-        (-0.0005, False),
+        (-0.0095, False),
         (0.02, True),
     ):
         pose = transform(np.eye(3), place((0, 0, depth)))
