@@ -102,7 +102,8 @@ def monte_carlo(name, options, trials, sigma_px):
         score, chi2, error, sigma = np.array(values).T
         print(
             f"{name:8}{kind:10}{np.mean(score):7.3f}"
-            f" +-{score.std() / len(score) ** 0.5:5.3f}{np.mean(chi2):10.3f}{np.sqrt(np.mean(error**2)):11.3f}"
+            f" +-{score.std() / len(score) ** 0.5:5.3f}{np.mean(chi2):10.3f}"
+            f"{np.sqrt(np.mean(error**2)):11.3f}"
             f"{np.sqrt(np.mean(sigma**2)):10.3f}{np.abs(error / sigma).max():12.2f}"
         )
 
