@@ -282,6 +282,9 @@ class Cell(_Model):
         names = [camera.name for camera in self.cameras]
         if len(set(names)) < len(names):
             raise ValueError(f"camera names must differ, got {names}")
+        boxes = [box.name for box in self.surroundings]
+        if len(set(boxes)) < len(boxes):
+            raise ValueError(f"names of surroundings must differ, got {boxes}")
         return self
 
     @property

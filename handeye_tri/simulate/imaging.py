@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 # The inverse lens is exact at nodes this far apart and splined between them, which
-# is off by 4e-9 px at k1 -0.2 in 1024 x 768 pixels and 40 times faster.
+# is off by 4e-9 px at k1 -0.2 in 1024 x 768 pixels.
 _NODE_SPACING_PX = 16.0
 # Rows of the image whose resampling weights are computed at once.
 _BAND = 16
@@ -105,11 +105,15 @@ class Optics:
             image = self.resample @ flat
             return np.asarray(image.reshape(height, width, channels))
         s = self.supersample
-        total = np.zeros((height, width, channels), dtype=np.uint16)
-        for row in range(s):
-            for column in range(s):
-                total += fine[row::s, column::s]
-        return total.astype(np.float32) / np.float32(s * s)
+        # Whole rows first: that is half of the strided work.
+        rows = fine[0::s].astype(np.uint16)
+        for k in range(1, s):
+            rows += fine[k::s]
+        total = rows[:, 0::s].astype(np.float32)
+        for k in range(1, s):
+            total += rows[:, k::s]
+        total *= np.float32(1.0 / (s * s))
+        return total
 
 
 def _ideal_pixels(camera: PinholeCamera, supersample: int) -> tuple[Floats, Floats]:
