@@ -56,7 +56,7 @@ def calibrate_session_cameras(session: Session) -> CameraCalibration:
 
     In step (4) the two stations of a half-turn are independent of each other. Tying
     them together by the robot's repeatability (0.03 mm, 0.005 degrees, at 0.015 px)
-    would lower the sigma of fx by 3 to 7 %, not enough to let a robot that repeats
+    would lower the sigma of fx by 5 to 12 %, not enough to let a robot that repeats
     worse than it says, or does not turn by 180 degrees, into the cameras. A single
     camera cannot do without the tie.
 

@@ -139,7 +139,8 @@ def free_scale(
     With the rotations of the hand-eye solution held, the translations of
     ``base_from_flange @ flange_from_triangle = base_from_camera @
     camera_from_triangle`` are linear in both unknown translations and in a factor
-    on the cameras' lengths.
+    on the cameras' lengths. The standard deviation holds what the residuals show and
+    what the cameras' own covariance adds: it moves all stations together.
     """
     stations = session.indices("calibration")
     observed = triangle_poses(
@@ -150,15 +151,18 @@ def free_scale(
         session.marker_radii,
     )
     flange = session.base_from_flange[stations[observed.views]]
-    seen = observed.reference_from_triangle[:, :3, 3]
-    n = len(seen)
-    rows = np.zeros((n, 3, 7))
+    poses = observed.reference_from_triangle
+    base_from_reference = calibration.base_from_camera[0].rotation
+    rows = np.zeros((len(poses), 3, 7))
     rows[:, :, :3] = -flange[:, :3, :3]
     rows[:, :, 3:6] = np.eye(3)
-    rows[:, :, 6] = seen @ calibration.base_from_camera[0].rotation.T
+    rows[:, :, 6] = poses[:, :3, 3] @ base_from_reference.T
     matrix, target = rows.reshape(-1, 7), flange[:, :3, 3].ravel()
-    solution, *_ = np.linalg.lstsq(matrix, target)
+    inverse = np.linalg.pinv(matrix)
+    solution = inverse @ target
     residual = target - matrix @ solution
-    variance = residual @ residual / (len(target) - 7)
-    covariance = variance * np.linalg.inv(matrix.T @ matrix)
-    return float(solution[6]), float(np.sqrt(covariance[6, 6]))
+    by_residuals = residual @ residual / (len(target) - 7) * inverse[6] @ inverse[6]
+    moved = base_from_reference @ poses[:, :3, :3] @ observed.by_cameras[:, :3]
+    gradient = -solution[6] * inverse[6] @ moved.reshape(len(target), -1)
+    by_cameras = gradient @ cameras.covariance.matrix @ gradient
+    return float(solution[6]), float(np.sqrt(by_residuals + by_cameras))

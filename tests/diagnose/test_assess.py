@@ -61,6 +61,19 @@ def test_a_healthy_session_passes(seed):
     assert abs(scale - 1) < 4 * sigma < 0.01
 
 
+def test_the_scale_scatters_as_it_says():
+    ratios = []
+    for seed in range(16):
+        session = observe(100 + seed)
+        cameras = calibrate_session_cameras(session)
+        scale, sigma = free_scale(
+            session, cameras, calibrate_hand_eye(session, cameras)
+        )
+        ratios.append((scale - 1) / sigma)
+    # The root mean square of 16 unit normals has a standard deviation of 0.18.
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.55
+
+
 def test_a_wrong_side_length_is_seen_as_a_scale():
     session = observe(1)
     rig = session.triangle
