@@ -62,26 +62,32 @@ install_packages() {
   fi
 }
 
+# The stamps say what was installed last: a new lock or another Python makes the
+# environment anew, a changed pyproject.toml only installs the project again.
 install_python() {
-  local python="$1" wanted
-  wanted="$("$python" -VV) $REPO $(cat "$REPO/scripts/requirements.txt" \
-    "$REPO/pyproject.toml" | sha256sum)"
-  if [[ -x "$VENV/bin/handeye-tri" && "$(cat "$VENV/installed" 2>/dev/null)" == "$wanted" ]] &&
-    "$VENV/bin/python" -c '' 2>/dev/null; then
-    return
+  local python="$1" packages project
+  packages="$("$python" -VV) $REPO $(sha256sum <"$REPO/scripts/requirements.txt")"
+  project="$(sha256sum <"$REPO/pyproject.toml")"
+  if [[ "$(cat "$VENV/packages" 2>/dev/null)" != "$packages" ]] ||
+    ! "$VENV/bin/python" -c '' 2>/dev/null; then
+    echo "setup: installing the locked Python packages into $VENV (a minute or two)" >&2
+    rm -rf "$VENV"
+    "$python" -m venv "$VENV" >&2 ||
+      die "$python could not make a virtual environment at $VENV"
+    pip_install --require-hashes -r "$REPO/scripts/requirements.txt" ||
+      die "pip could not install scripts/requirements.txt; its message is above"
+    echo "$packages" >"$VENV/packages"
   fi
-  echo "setup: installing the locked Python packages into $VENV (a minute or two)" >&2
-  rm -rf "$VENV"
-  "$python" -m venv "$VENV" >&2 ||
-    die "$python could not make a virtual environment at $VENV"
-  "$VENV/bin/python" -m pip install -qq --disable-pip-version-check \
-    --require-hashes -r "$REPO/scripts/requirements.txt" >&2 ||
-    die "pip could not install scripts/requirements.txt; its message is above"
-  # The build backend is in the lock too: nothing more is fetched here.
-  "$VENV/bin/python" -m pip install -qq --disable-pip-version-check \
-    --no-index --no-deps --no-build-isolation --editable "$REPO" >&2 ||
-    die "pip could not install the project; its message is above"
-  echo "$wanted" >"$VENV/installed"
+  if [[ "$(cat "$VENV/project" 2>/dev/null)" != "$project" ]]; then
+    # The build backend is in the lock too: nothing is fetched here.
+    pip_install --no-index --no-deps --no-build-isolation --editable "$REPO" ||
+      die "pip could not install the project; its message is above"
+    echo "$project" >"$VENV/project"
+  fi
+}
+
+pip_install() {
+  "$VENV/bin/python" -m pip install -qq --disable-pip-version-check "$@" >&2
 }
 
 setup() {

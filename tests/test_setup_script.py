@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -126,24 +125,58 @@ def test_no_python_that_is_new_enough(machine: Machine) -> None:
     assert done.stderr.startswith("setup: no Python 3.11 or newer found; install one")
 
 
-def test_a_finished_environment_is_left_alone_and_a_stale_one_is_not(
+class Environment:
+    """A pretended virtual environment, and the Python that it was made with."""
+
+    def __init__(self, machine: Machine) -> None:
+        self.machine = machine
+        self.venv = machine.folder / "venv"
+        # A Python that makes environments whose pip only says what it was asked.
+        pip = f'[ "$1" = -m ] && echo "${{@: -1}}" >>{machine.calls}; exit 0'
+        machine.command("pip-python", pip)
+        machine.command(
+            "py",
+            'case "$*" in\n'
+            "-VV) echo Python 3.11.0 ;;\n"
+            f'*venv*) mkdir -p "$3/bin"; cp {machine.folder}/pip-python '
+            '"$3/bin/python"; echo venv >>"$HERE/calls" ;;\n'
+            "esac",
+        )
+
+    def install(self) -> list[str]:
+        """What one more installation did."""
+        self.machine.calls.write_text("")
+        done = self.machine.run(
+            f"VENV={self.venv}; install_python {self.machine.folder}/py"
+        )
+        assert done.returncode == 0, done.stderr
+        return self.machine.calls.read_text().splitlines()
+
+
+def test_an_environment_is_made_once_and_again_when_it_is_stale(
     machine: Machine,
 ) -> None:
-    """The stamp holds for this lock and this Python; a broken venv is made anew."""
-    venv = machine.folder / "venv"
-    (venv / "bin").mkdir(parents=True)
-    (venv / "bin" / "python").symlink_to(sys.executable)
-    (venv / "bin" / "handeye-tri").touch(mode=0o755)
-    machine.command("python", '[ "$1" = -VV ] && echo Python 3.11.0 || exit 7')
-    prefix = f"VENV={venv}; stamp={venv}/installed; py={machine.folder}/python\n"
-    write = (
-        'echo "$($py -VV) $REPO $(cat "$REPO/scripts/requirements.txt" '
-        '"$REPO/pyproject.toml" | sha256sum)" >$stamp\n'
+    environment = Environment(machine)
+    everything = ["venv", str(REPO / "scripts" / "requirements.txt"), str(REPO)]
+    assert environment.install() == everything
+    assert environment.install() == []
+    # Another lock or Python, an interpreter that is gone, an interrupted first time.
+    (environment.venv / "packages").write_text("something else\n")
+    assert environment.install() == everything
+    (environment.venv / "bin" / "python").unlink()
+    assert environment.install() == everything
+    (environment.venv / "packages").unlink()
+    assert environment.install() == everything
+    # Another pyproject.toml.
+    (environment.venv / "project").write_text("something else\n")
+    assert environment.install() == [str(REPO)]
+    assert environment.install() == []
+
+
+def test_a_python_that_makes_no_environment(machine: Machine) -> None:
+    machine.command("py", '[ "$1" = -VV ] || exit 7')
+    done = machine.run(
+        f"VENV={machine.folder}/venv; install_python {machine.folder}/py"
     )
-    done = machine.run(prefix + write + "install_python $py")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert venv.exists()
-    done = machine.run(prefix + "echo old >$stamp\ninstall_python $py")
-    assert done.returncode == 2  # the pretended Python makes no environment
+    assert done.returncode == 2
     assert "could not make a virtual environment" in done.stderr
-    assert not (venv / "installed").exists()
