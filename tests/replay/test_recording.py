@@ -1,0 +1,252 @@
+"""The recording: whole, the same each time, and equal to what was evaluated."""
+
+import io
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from finished_session import (
+    BASE_FROM_WORLD,
+    finished,
+    mechanism,
+    photograph,
+    world_from_body,
+)
+from PIL import Image
+from rerun.chunk import RrdReader
+
+from handeye_tri.errors import InputError, StorageError
+from handeye_tri.records import TrackEvaluation
+from handeye_tri.replay import write_recording
+from handeye_tri.replay.recording import read_numbers
+
+
+def write(path, **changes):
+    done = finished()
+    arguments = {
+        "name": "test 1",
+        "mechanism": mechanism(),
+        "world_from_body": world_from_body(done.session),
+        "base_from_world": BASE_FROM_WORLD,
+        "session": done.session,
+        "photograph": photograph,
+        "calibration": done.calibration,
+        "track": done.track,
+        "truth": done.truth,
+        "verdict": "# PASS",
+    }
+    write_recording(path, **{**arguments, **changes})
+    return done
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "replay.rrd"
+    write(path)
+    return path
+
+
+def column(path, entity, component):
+    """Values by station; None is the key of what holds at all times."""
+    found = {}
+    for chunk in RrdReader(path).stream().filter(content=f"/{entity}").to_chunks():
+        batch = chunk.to_record_batch()
+        if component not in batch.schema.names:
+            continue
+        values = batch.column(component).to_pylist()
+        names = batch.schema.names
+        when = (
+            batch.column("station").to_pylist()
+            if "station" in names
+            else [None] * len(values)
+        )
+        found.update(zip(when, values, strict=True))
+    return found
+
+
+def test_the_held_out_track_reads_back_equal_to_the_bit(recording):
+    track = finished().track
+    numbers = read_numbers(recording)
+    again = TrackEvaluation(
+        np.array(numbers["stations"]),
+        np.array(numbers["markers"]),
+        np.array(numbers["reported_m"]),
+        np.array(numbers["observed_m"]),
+        np.array(numbers["predicted_covariance_m2"]),
+    )
+    for name in (
+        "stations",
+        "markers",
+        "reported",
+        "observed",
+        "predicted_covariance",
+        "distances",
+    ):
+        assert np.array_equal(getattr(again, name), getattr(track, name)), name
+    assert numbers["mean_mm"] == 1e3 * track.mean
+    assert numbers["rms_mm"] == 1e3 * track.rms
+    assert numbers["max_mm"] == 1e3 * track.max
+    assert numbers["predicted_rms_mm"] == 1e3 * track.predicted_rms
+
+
+def test_the_plotted_errors_are_the_evaluated_ones_to_the_bit(recording):
+    track = finished().track
+    plotted = column(recording, "error_mm/held_out", "Scalars:scalars")
+    assert sorted(plotted, key=str) == sorted(set(track.stations.tolist()), key=str)
+    for row, distance in enumerate(track.distances):
+        found = plotted[int(track.stations[row])][int(track.markers[row])]
+        assert found == 1e3 * distance
+
+
+def test_read_back_as_a_table_by_the_catalog(recording):
+    """The way that a user reads a recording with rerun's own tools."""
+    pytest.importorskip("datafusion")
+    store = RrdReader(recording).stream().collect()
+    table = store.reader(index="station", contents="/error_mm/**").to_pandas()
+    held_out = table.dropna(subset=["/error_mm/held_out:Scalars:scalars"])
+    values = np.array(held_out["/error_mm/held_out:Scalars:scalars"].tolist())
+    track = finished().track
+    assert values.max() == 1e3 * track.max
+
+
+def test_bodies_stand_where_the_mechanism_puts_them(recording):
+    session = finished().session
+    path = f"cell/robot/{rr.escape_entity_path_part('link/1 t')}"
+    moved = column(recording, path, "Transform3D:translation")
+    expected = world_from_body(session)[:, 2, :3, 3]
+    for j in range(len(session.stations)):
+        # rerun keeps positions in 32 bits.
+        assert np.allclose(moved[j][0], expected[j], atol=1e-6)
+
+
+def test_every_shape_is_drawn(recording):
+    drawn = " ".join(
+        name
+        for chunk in RrdReader(recording).stream().to_chunks()
+        if "/surroundings/" in chunk.entity_path or "/robot/" in chunk.entity_path
+        for name in chunk.to_record_batch().schema.names
+    )
+    for archetype in ("Boxes3D", "Cylinders3D", "Capsules3D", "Ellipsoids3D", "Mesh3D"):
+        assert archetype in drawn
+
+
+def test_what_is_seen_lies_on_the_image_by_rerun_s_pixel_corners(recording):
+    """Our pixel (0, 0) is the first pixel's centre; rerun's is its corner."""
+    session = finished().session
+    rings = column(recording, "cell/base/estimate/left/seen", "LineStrips2D:strips")
+    for k in range(3):
+        centre = np.mean(rings[0][k][:-1], axis=0)
+        assert np.allclose(centre, session.pixels[0, 0, k] + 0.5, atol=1e-3)
+
+
+def test_images_are_stored_as_jpeg_of_the_same_picture(recording):
+    blobs = column(recording, "cell/base/estimate/right/image", "EncodedImage:blob")
+    assert len(blobs) == len(finished().session.stations)
+    image = np.asarray(Image.open(io.BytesIO(bytes(blobs[4][0]))))
+    assert image.shape == (768, 1024, 3)
+    assert np.abs(image.astype(int) - photograph("right", 4)).mean() < 2
+
+
+def test_grey_images_are_taken_too(tmp_path):
+    def grey(camera, station):
+        return photograph(camera, station)[..., 0]
+
+    write(tmp_path / "grey.rrd", photograph=grey)
+    blobs = column(
+        tmp_path / "grey.rrd", "cell/base/estimate/left/image", "EncodedImage:blob"
+    )
+    assert np.asarray(Image.open(io.BytesIO(bytes(blobs[0][0])))).shape == (768, 1024)
+
+
+def test_the_same_input_gives_the_same_recording(recording, tmp_path):
+    write(tmp_path / "again.rrd")
+    tool = Path(sys.prefix) / "bin" / "rerun"
+    compared = subprocess.run(
+        [tool, "rrd", "compare", "--unordered", recording, tmp_path / "again.rrd"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert compared.returncode == 0, compared.stderr
+    # The comparison does see a difference where there is one.
+    write(tmp_path / "other.rrd", verdict="# FAIL")
+    compared = subprocess.run(
+        [tool, "rrd", "compare", "--unordered", recording, tmp_path / "other.rrd"],
+        capture_output=True,
+        check=False,
+    )
+    assert compared.returncode != 0
+
+
+def test_without_truth_nothing_grey_is_drawn(tmp_path):
+    write(tmp_path / "real.rrd", truth=None)
+    paths = {
+        chunk.entity_path
+        for chunk in RrdReader(tmp_path / "real.rrd").stream().to_chunks()
+    }
+    assert not [path for path in paths if "truth" in path]
+
+
+def test_a_marker_that_was_not_seen_is_left_out(tmp_path):
+    done = finished()
+    pixels = done.session.pixels.copy()
+    pixels[0, 0, 1] = np.nan
+    pixels[:, 1] = np.nan
+    covariance = done.session.pixel_covariance.copy()
+    covariance[~np.isfinite(pixels).all(axis=-1)] = np.nan
+    session = replace(done.session, pixels=pixels, pixel_covariance=covariance)
+    path = tmp_path / "unseen.rrd"
+    write(path, session=session)
+    rings = column(path, "cell/base/estimate/left/seen", "LineStrips2D:strips")
+    assert [len(rings[j]) for j in (0, 1, 2)] == [2, 0, 3]
+    errors = column(path, "error_mm/used", "Scalars:scalars")
+    assert np.isfinite(errors[0]).tolist() == [True, False, True]
+    assert not np.isfinite(errors[1]).any()
+
+
+def test_nothing_is_written_where_an_image_is_missing(tmp_path):
+    def torn(camera, station):
+        if station == 3:
+            raise StorageError("left_003.png: this file is missing")
+        return photograph(camera, station)
+
+    path = tmp_path / "replay.rrd"
+    with pytest.raises(StorageError, match="left_003"):
+        write(path, photograph=torn)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_poses_that_do_not_fit_are_refused(tmp_path):
+    poses = world_from_body(finished().session)
+    with pytest.raises(InputError, match="world_from_body must have shape"):
+        write(tmp_path / "replay.rrd", world_from_body=poses[:-1])
+
+
+@pytest.mark.parametrize("content", [None, b"not a recording"])
+def test_another_file_is_refused_by_name(tmp_path, content):
+    path = tmp_path / "replay.rrd"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(StorageError, match="replay.rrd"):
+        read_numbers(path)
+
+
+def test_a_recording_of_something_else_is_refused(tmp_path):
+    path = tmp_path / "other.rrd"
+    other = rr.RecordingStream("other")
+    other.save(path)
+    other.log("x", rr.Scalars(1.0))
+    other.flush()
+    other.disconnect()
+    with pytest.raises(StorageError, match="not a recording of ours"):
+        read_numbers(path)
+
+
+def test_strict_mode_is_left_as_it_was(tmp_path):
+    before = rr.strict_mode()
+    write(tmp_path / "replay.rrd")
+    assert rr.strict_mode() == before
