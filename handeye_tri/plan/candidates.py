@@ -21,7 +21,7 @@ _MOST_POSES = 3600
 _HOPELESS = 1200
 # Inverse solutions of a pose that are tried, nearest to those before first.
 _SOLUTIONS = 4
-_STARTS = 12
+_STARTS = 9
 # The sphere to see whole is larger than the marker by this factor: blur and the
 # detector's window reach beyond the outline.
 SIGHT_MARGIN = 1.15

@@ -71,7 +71,7 @@ def test_every_drawn_pose_is_found_or_counted():
 
 def test_a_wrist_that_cannot_turn_is_named():
     """Neither the last joint, nor turning the wrist over, nor reaching backwards."""
-    arm = limited("hp3_stereo", t=(-80, 80), b=(5, 120), s=(-60, 60))
+    arm = limited("hp3_stereo", t=(-80, 80), b=(5, 120), r=(-60, 60), s=(-60, 60))
     one = search("hp3_stereo", arm)
     assert one.find(1, turns=True) == []
     assert one.rejected["half_turn"] + one.rejected["limits"] > 500

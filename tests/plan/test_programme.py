@@ -11,6 +11,7 @@ from handeye_tri.arm import Arm
 from handeye_tri.errors import InputError, NoPlanError
 from handeye_tri.plan import plan_motions
 from handeye_tri.plan.poses import View
+from handeye_tri.simulate import compile_mechanism
 from handeye_tri.simulate.compile import compile_cell
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -179,11 +180,12 @@ def test_the_certificate_names_every_estimated_quantity(name):
 
 
 def test_same_seed_same_plan_and_another_seed_another():
-    cell, arm = scene.cell_of("hp3_stereo"), scene.arm_of("hp3_stereo")
-    first = scene.plan_of("hp3_stereo")
-    # A fresh arm, so that nothing it remembers can matter.
-    again = plan_motions(cell, Arm(scene.compiled(cell)), 1)
-    other = plan_motions(cell, arm, 2)
+    cell = scene.cell_of("hp3_stereo")
+    # Fresh arms, so that nothing an arm remembers can matter.
+    first, again, other = (
+        plan_motions(cell, Arm(scene.compiled(cell)), seed, half_turns=3)
+        for seed in (1, 1, 2)
+    )
     for a, b in zip(first.stations, again.stations, strict=True):
         np.testing.assert_array_equal(a.joints, b.joints)
     assert dict(first.certificate) == dict(again.certificate)
@@ -262,3 +264,29 @@ def test_an_impossible_cell_names_the_check_and_what_to_do(check):
     assert time.process_time() - start < 20
     assert caught.value.rejected[check] > 0
     assert f"{check} {caught.value.rejected[check]}" in str(caught.value)
+
+
+def test_a_seven_joint_arm_whose_flange_leans_is_planned_for(tmp_path):
+    """A roll in the lower arm, and a flange axis that is not the last joint's."""
+    text = scene.MODEL.read_text()
+    lower_arm = '<joint name="l" axis="0 1 0" range="-85 90"/>'
+    flange = 'quat="0.7071067811865476 0 0.7071067811865476 0"'
+    assert text.count(lower_arm) == text.count(flange) == 1
+    text = text.replace(
+        lower_arm, lower_arm + '<joint name="roll" axis="0 0 1" range="-120 120"/>'
+    ).replace(flange, 'euler="0 105 0"')
+    model = tmp_path / "seven.xml"
+    model.write_text(text)
+    cell = scene.cell_of("hp3_stereo")
+    arm = Arm(compile_mechanism(cell, model))
+    assert len(arm.joint_names) == 7
+    plan = plan_motions(cell, arm, 1, half_turns=3)
+    joints = np.array([s.joints for s in plan.stations])
+    assert ((joints >= arm.lower) & (joints <= arm.upper)).all()
+    poses = np.array([s.base_from_flange.matrix for s in plan.stations])
+    np.testing.assert_allclose(arm.forward(joints), poses, atol=1e-9)
+    np.testing.assert_allclose(poses[0:6:2] @ HALF_TURN, poses[1:6:2], atol=1e-9)
+    # The last joint alone cannot do it: the others move as well.
+    assert (np.abs(np.diff(joints[:2, :-1], axis=0)) > 0.01).any()
+    for a, b in zip(joints[:-1], joints[1:], strict=True):
+        assert arm.path_collision(a, b) is None
