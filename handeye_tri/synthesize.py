@@ -314,6 +314,7 @@ def synthesize(
         geometry.base_from_camera,
         geometry.flange_from_triangle,
         executed,
+        flange_points,
     )
     return session, truth
 

@@ -6,6 +6,7 @@ Metres, radians and pixels inside; files and people get mm and degrees by name.
 
 from handeye_tri.records.arrays import Floats, locked
 from handeye_tri.records.covariance import (
+    MARKER_LABELS,
     MOTION_QUANTITIES,
     Covariance,
     motion_labels,
@@ -29,6 +30,7 @@ from handeye_tri.records.session import (
 __all__ = [
     "Floats",
     "locked",
+    "MARKER_LABELS",
     "MOTION_QUANTITIES",
     "Covariance",
     "motion_labels",

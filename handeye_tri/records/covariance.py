@@ -9,6 +9,7 @@ import numpy as np
 
 from handeye_tri.errors import InputError
 from handeye_tri.records.arrays import Floats, locked
+from handeye_tri.triangle import VERTICES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,3 +80,7 @@ def motion_labels(name: str) -> tuple[str, ...]:
     The tangent is on the right: ``true = estimate @ SE3.exp(tangent)``.
     """
     return tuple(f"{name}.{quantity}" for quantity in MOTION_QUANTITIES)
+
+
+# A, B, C in the flange frame, metres; the error is estimate less truth.
+MARKER_LABELS = tuple(f"marker_{k}.{axis}" for k in VERTICES for axis in "xyz")

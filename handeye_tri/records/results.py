@@ -76,13 +76,17 @@ class HandEyeCalibration:
         flange_from_triangle: How the rig sits on the flange.
         markers: A, B, C in the flange frame, shape (3, 3), metres.
         covariance: Labels as in CameraCalibration, and "base_from_<camera>.x" ...,
-            "flange_from_triangle.x" ....
+            "flange_from_triangle.x" ...; where the markers are estimated,
+            "marker_A.x" ... in the flange frame (m), and those of ``robot``.
         chi2: Sum of squared whitened residuals of the hand-eye step.
         dof: Its degrees of freedom.
         residuals: One tangent per calibration station, shape (n, 6), m and rad:
             the log of (robot chain)^-1 @ (camera chain).
         method: How this was reached.
         alternatives: What other solvers give for base_from_<first camera>.
+        robot: Systematic errors of the robot that were estimated, by label (m, rad,
+            s): true poses are the reported ones with these applied.
+        details: Numbers that a method adds, by name.
     """
 
     cameras: tuple[PinholeCamera, ...]
@@ -95,6 +99,8 @@ class HandEyeCalibration:
     residuals: Floats
     method: str
     alternatives: Mapping[str, SE3] = field(default_factory=dict)
+    robot: Mapping[str, float] = field(default_factory=dict)
+    details: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Lock; raise InputError unless each camera has a place."""
@@ -118,20 +124,25 @@ class GroundTruth:
         base_from_camera: Where they truly stand.
         flange_from_triangle: How the rig truly sits.
         base_from_flange: True flange poses, shape (n, 4, 4), metres.
+        markers: True A, B, C in the flange frame, shape (3, 3), metres; None where
+            only the triangle's frame is known.
     """
 
     cameras: tuple[PinholeCamera, ...]
     base_from_camera: tuple[SE3, ...]
     flange_from_triangle: SE3
     base_from_flange: Floats
+    markers: Floats | None = None
 
     def __post_init__(self) -> None:
-        """Lock the poses."""
+        """Lock poses and markers."""
         object.__setattr__(
             self,
             "base_from_flange",
             locked("base_from_flange", self.base_from_flange, (None, 4, 4)),
         )
+        if self.markers is not None:
+            object.__setattr__(self, "markers", locked("markers", self.markers, (3, 3)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

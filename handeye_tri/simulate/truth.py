@@ -59,4 +59,5 @@ def ground_truth(cell: Cell, arm: Arm, joints: ArrayLike) -> GroundTruth:
         ),
         flange_from_triangle=cell.rig.flange_from_triangle,
         base_from_flange=arm.forward(joints),
+        markers=cell.rig.flange_from_triangle.apply(cell.rig.triangle.points),
     )

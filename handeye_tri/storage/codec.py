@@ -160,12 +160,16 @@ def truth_to_json(truth: GroundTruth, joints: NDArray[np.float64]) -> Json:
         "base_from_flange": [
             motion_to_json(SE3(matrix)) for matrix in truth.base_from_flange
         ],
+        "markers_in_flange_m": None
+        if truth.markers is None
+        else numbers(truth.markers),
         "executed_joints_rad_or_m": numbers(joints),
     }
 
 
 def truth_from_json(data: Mapping[str, Any]) -> tuple[GroundTruth, NDArray[np.float64]]:
     """Inverse of :func:`truth_to_json`."""
+    markers = data.get("markers_in_flange_m")
     truth = GroundTruth(
         cameras=tuple(camera_from_json(camera) for camera in data["cameras"]),
         base_from_camera=tuple(motion_from_json(m) for m in data["base_from_camera"]),
@@ -173,6 +177,7 @@ def truth_from_json(data: Mapping[str, Any]) -> tuple[GroundTruth, NDArray[np.fl
         base_from_flange=np.array(
             [motion_from_json(m).matrix for m in data["base_from_flange"]]
         ),
+        markers=None if markers is None else array(markers, "markers_in_flange_m"),
     )
     return truth, array(data["executed_joints_rad_or_m"], "executed_joints_rad_or_m")
 
@@ -231,6 +236,7 @@ def hand_eye_to_json(result: HandEyeCalibration) -> Json:
         "base_from_reference_by_method": {
             name: motion_to_json(motion) for name, motion in result.alternatives.items()
         },
+        "robot_parameters_m_rad_s": dict(result.robot),
     }
 
 
@@ -253,5 +259,9 @@ def hand_eye_from_json(data: Mapping[str, Any]) -> HandEyeCalibration:
         alternatives={
             str(name): motion_from_json(motion)
             for name, motion in data["base_from_reference_by_method"].items()
+        },
+        robot={
+            str(name): float(value)
+            for name, value in data.get("robot_parameters_m_rad_s", {}).items()
         },
     )

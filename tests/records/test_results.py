@@ -125,3 +125,5 @@ def test_hand_eye_and_truth_lock_and_check() -> None:
     assert not truth.base_from_flange.flags.writeable
     with pytest.raises(InputError, match="base_from_flange must have shape"):
         GroundTruth((CAMERA,), (SE3.identity(),), SE3.identity(), np.eye(4))
+    with pytest.raises(InputError, match="markers must have shape"):
+        GroundTruth((CAMERA,), (SE3.identity(),), SE3.identity(), [np.eye(4)], [[0.0]])  # type: ignore[arg-type]

@@ -80,11 +80,14 @@ def test_plan():
 
 def test_truth():
     poses = np.array([MOTION.matrix, HALF_TURN.matrix])
-    truth = GroundTruth((CAMERA,), (MOTION,), HALF_TURN, poses)
+    markers = RNG.normal(size=(3, 3))
+    truth = GroundTruth((CAMERA,), (MOTION,), HALF_TURN, poses, markers)
     joints = RNG.normal(size=(2, 6))
-    back, executed = codec.truth_from_json(
-        through_text(codec.truth_to_json(truth, joints))
-    )
+    data = through_text(codec.truth_to_json(truth, joints))
+    back, executed = codec.truth_from_json(data)
+    assert np.array_equal(back.markers, markers)
+    del data["markers_in_flange_m"]
+    assert codec.truth_from_json(data)[0].markers is None
     assert np.array_equal(executed, joints)
     assert np.abs(back.base_from_flange - poses).max() < 1e-15
     assert close(back.flange_from_triangle, HALF_TURN)
@@ -114,7 +117,7 @@ def test_camera_calibration_keeps_unseen_residuals():
 def test_hand_eye():
     result = HandEyeCalibration(
         (CAMERA,), (MOTION,), HALF_TURN, RNG.normal(size=(3, 3)), COVARIANCE, 3.0, 4,
-        RNG.normal(size=(5, 6)), "way", {"shah": MOTION},
+        RNG.normal(size=(5, 6)), "way", {"shah": MOTION}, {"elbow.offset": 1e-3},
     )  # fmt: skip
     back = codec.hand_eye_from_json(through_text(codec.hand_eye_to_json(result)))
     assert close(back.base_from_camera[0], MOTION)
@@ -122,6 +125,7 @@ def test_hand_eye():
     assert np.array_equal(back.markers, result.markers)
     assert np.array_equal(back.residuals, result.residuals)
     assert close(back.alternatives["shah"], MOTION)
+    assert back.robot == {"elbow.offset": 1e-3}
 
 
 def test_ragged_numbers_are_refused():
