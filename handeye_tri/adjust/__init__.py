@@ -1,0 +1,19 @@
+"""One adjustment of everything: cameras, their places, markers, robot poses."""
+
+from handeye_tri.adjust.joint import adjust
+from handeye_tri.adjust.robot import (
+    RobotParameters,
+    clock_offset,
+    joint_offsets,
+    link_corrections,
+)
+from handeye_tri.adjust.robust import Loss
+
+__all__ = [
+    "Loss",
+    "RobotParameters",
+    "adjust",
+    "clock_offset",
+    "joint_offsets",
+    "link_corrections",
+]

@@ -1,0 +1,270 @@
+"""From the minimum of a joint adjustment to its record: covariance, residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.adjust.model import AdjustmentModel, Linearisation, State
+from handeye_tri.adjust.robust import apply_loss
+from handeye_tri.calibrate_cameras.least_squares import Minimum
+from handeye_tri.camera import INTRINSIC_NAMES, Intrinsics, Lens, PinholeCamera
+from handeye_tri.errors import DegenerateMotionError
+from handeye_tri.records import (
+    MARKER_LABELS,
+    Covariance,
+    HandEyeCalibration,
+    Session,
+    motion_labels,
+)
+from handeye_tri.se3 import SE3, hat
+
+Floats = NDArray[np.float64]
+
+# Scaled information worse conditioned than this is singular in double precision.
+_MAX_CONDITION = 1e13
+# A station's own six equations worse conditioned than this do not fix the flange.
+_MAX_STATION_CONDITION = 1e12
+
+
+def unknown_labels(
+    model: AdjustmentModel, cameras: Sequence[PinholeCamera]
+) -> tuple[str, ...]:
+    """Labels of the shared unknowns, in their order."""
+    labels: list[str] = []
+    for i, camera in enumerate(cameras):
+        labels += [f"{camera.name}.{INTRINSIC_NAMES[k]}" for k in model.intrinsics[i]]
+        labels += [f"{camera.name}.{camera.lens.names[k]}" for k in model.lenses[i]]
+        labels += motion_labels(f"base_from_{camera.name}")
+    labels += motion_labels("rig") if model.sides.exact else MARKER_LABELS
+    return (*labels, *(() if model.robot is None else model.robot.labels))
+
+
+def check_determined(
+    end: Minimum[State, Linearisation], cameras: Sequence[PinholeCamera]
+) -> float:
+    """Condition number of the shared unknowns' scaled information.
+
+    Raises:
+        DegenerateMotionError: the data do not determine them; names those that
+            trade against each other.
+    """
+    information = end.blocks.equations().reduced()
+    diagonal = np.diagonal(information)
+    labels = unknown_labels(end.blocks.model, cameras)
+    if (diagonal <= 0).any():
+        lost = [labels[k] for k in np.flatnonzero(diagonal <= 0)]
+        raise DegenerateMotionError(
+            f"nothing in the data depends on {', '.join(lost)}; add stations that do, "
+            "or estimate fewer unknowns"
+        )
+    scale = 1.0 / np.sqrt(diagonal)
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    if values[0] * _MAX_CONDITION < values[-1]:
+        weak = np.argsort(-np.abs(vectors[:, 0]))[:4]
+        raise DegenerateMotionError(
+            f"the data do not determine all {len(labels)} unknowns together: "
+            f"{', '.join(labels[k] for k in weak)} trade against each other "
+            f"(condition {values[-1] / max(values[0], 1e-300):.2g}); turn the flange "
+            "about two or more axes by at least 20 degrees, or estimate fewer unknowns"
+        )
+    return float(values[-1] / values[0])
+
+
+def adjustment_result(
+    session: Session,
+    start: HandEyeCalibration,
+    end: Minimum[State, Linearisation],
+    undetermined: tuple[str, ...],
+    correlation: float,
+) -> HandEyeCalibration:
+    """Put a minimum into the record, see :func:`handeye_tri.adjust.adjust`."""
+    state, model = end.state, end.blocks.model
+    condition = check_determined(end, start.cameras)
+    information = end.blocks.equations().reduced()
+    scale = 1.0 / np.sqrt(np.diagonal(information))
+    shared = np.linalg.inv(information * np.outer(scale, scale))
+    shared = 0.5 * (shared + shared.T) * np.outer(scale, scale)
+    labels, by_unknowns = _derived(model, state, start.cameras)
+    matrix = by_unknowns @ shared @ by_unknowns.T
+    stations, residuals = _station_residuals(model, state)
+    present = model.stations.index >= 0
+    n = len(session.stations)
+    pixel_residuals = np.full((len(start.cameras), n, 3, 2), np.nan)
+    pixel_residuals[:, model.stations.index[present]] = model.residuals(state)[
+        :, present
+    ]
+    corrections = np.full((n, 6), np.nan)
+    corrections[model.stations.index[present]] = model.missed(state, slice(None))[
+        present
+    ]
+    return HandEyeCalibration(
+        cameras=tuple(
+            PinholeCamera(
+                camera.name,
+                Intrinsics.from_vector(state.intrinsics[i]),
+                camera.image_size,
+                Lens(camera.lens.model, state.lenses[i]),
+            )
+            for i, camera in enumerate(start.cameras)
+        ),
+        base_from_camera=tuple(SE3(motion) for motion in state.base_from_camera),
+        flange_from_triangle=triangle_frame(state.markers),
+        markers=state.markers,
+        covariance=Covariance(labels, 0.5 * (matrix + matrix.T)),
+        chi2=end.cost,
+        dof=end.blocks.observations - end.blocks.unknowns,
+        residuals=residuals,
+        method=_method(model),
+        alternatives={**start.alternatives, "separate": start.base_from_camera[0]},
+        robot={}
+        if model.robot is None
+        else dict(zip(model.robot.labels, state.robot.tolist(), strict=True)),
+        details={
+            "pixel_residuals": pixel_residuals,
+            "corrections": corrections,
+            "stations": stations,
+            **_chi2_parts(model, state, end.cost),
+            "undetermined": undetermined,
+            "on_axis_correlation": correlation,
+            "iterations": end.iterations,
+            "condition": condition,
+        },
+    )
+
+
+def _method(model: AdjustmentModel) -> str:
+    words = ["joint adjustment"]
+    if model.sides.exact:
+        words.append("exact sides")
+    elif model.sides.count:
+        words.append(f"sides known to {1e3 * model.sides.sigma:g} mm")
+    else:
+        words.append("markers self-calibrated")
+    if model.robot is not None:
+        words.append(f"{len(model.robot.labels)} parameters of the robot")
+    if model.loss is not None:
+        words.append(f"{model.loss.name} loss from {model.loss.threshold:g} sigmas")
+    return ", ".join(words)
+
+
+def _chi2_parts(model: AdjustmentModel, state: State, cost: float) -> dict[str, float]:
+    sides = (
+        model.sides.residuals(state.markers)[0] if model.sides.count else np.empty(0)
+    )
+    scaled = np.empty(0) if model.robot is None else state.robot / model.robot.sigma
+    parts = {
+        "chi2_robot": float(np.vdot(state.missed, state.missed)),
+        "chi2_sides": float(sides @ sides),
+        "chi2_parameters": float(scaled @ scaled),
+    }
+    return {"chi2_pixels": cost - sum(parts.values()), **parts}
+
+
+def triangle_frame(markers: Floats) -> SE3:
+    """flange_from_triangle of markers A, B, C in the flange, shape (3, 3), metres."""
+    along, toward = markers[1] - markers[0], markers[2] - markers[0]
+    x = along / np.linalg.norm(along)
+    z = np.cross(x, toward)
+    z /= np.linalg.norm(z)
+    return SE3.from_parts(np.stack([x, np.cross(z, x), z], axis=1), markers[0])
+
+
+def _frame_by_markers(markers: Floats) -> Floats:
+    """Derivative of the right tangent of the triangle's frame by A, B, C, (6, 9).
+
+    A marker P in the triangle's frame moves in the flange by R (dt + dr x P + dP),
+    where dP is along x for B, in the plane for C: nine numbers for nine.
+    """
+    frame = triangle_frame(markers)
+    points = frame.inverse().apply(markers)
+    by_frame = np.zeros((3, 3, 9))
+    by_frame[..., :3], by_frame[..., 3:6] = np.eye(3), -hat(points)
+    by_frame[1, 0, 6] = by_frame[2, 0, 7] = by_frame[2, 1, 8] = 1.0
+    by_shape = (frame.rotation @ by_frame).reshape(9, 9)
+    return np.asarray(np.linalg.inv(by_shape)[:6])
+
+
+def _derived(
+    model: AdjustmentModel, state: State, cameras: Sequence[PinholeCamera]
+) -> tuple[tuple[str, ...], Floats]:
+    """Labels of all reported quantities, and their derivative by the unknowns."""
+    g = model.shared
+    eye = np.eye(g)
+    labels: list[str] = []
+    rows, places = [], []
+    for columns in model.columns:
+        own = eye[columns]
+        labels += unknown_labels(model, cameras)[columns][:-6]
+        rows.append(own[:-6])
+        places.append(own[-6:])
+    first = SE3(state.base_from_camera[0])
+    for i, camera in enumerate(cameras):
+        if i:
+            # Z0 exp(d0) M exp(d) = Zi exp(di): d = di - Ad(M^-1) d0.
+            motion = SE3(state.base_from_camera[i]).inverse() @ first
+            labels += motion_labels(f"reference_from_{camera.name}")
+            rows.append(places[i] - motion.adjoint() @ places[0])
+    for i, camera in enumerate(cameras):
+        labels += motion_labels(f"base_from_{camera.name}")
+        rows.append(places[i])
+    by_markers = eye[model.rig]
+    if model.sides.exact:
+        by_rig = np.concatenate(
+            [np.broadcast_to(np.eye(3), (3, 3, 3)), -hat(state.markers)], axis=-1
+        )
+        by_markers = by_rig.reshape(9, 6) @ by_markers
+    labels += [*motion_labels("flange_from_triangle"), *MARKER_LABELS]
+    rows += [_frame_by_markers(state.markers) @ by_markers, by_markers]
+    if model.robot is not None:
+        labels += model.robot.labels
+        rows.append(eye[model.rig.stop :])
+    return tuple(labels), np.concatenate(rows)
+
+
+def _station_residuals(
+    model: AdjustmentModel, state: State
+) -> tuple[NDArray[np.intp], Floats]:
+    """Stations whose pixels alone fix the flange, and by how much it is off there.
+
+    One Gauss-Newton step of each station's pose from the adjusted one, which is the
+    tangent between robot chain and camera chain to first order.
+
+    Returns:
+        Station indices (s,), tangents in the triangle's frame (s, 6), m and rad.
+    """
+    width = model.stations.index.shape[1]
+    every = slice(None)
+    xi = model.missed(state, every)
+    free = replace(model, root=np.eye(6))
+    at = replace(state, missed=xi.reshape(len(xi), -1))
+    size = free.own
+    normal = np.zeros((model.blocks, size, size))
+    gradient = np.zeros((model.blocks, size))
+    for chunk, _, _, rows in free.rows(at):
+        apply_loss(rows, model.loss)
+        flat = rows.reshape(len(rows), -1, rows.shape[-1])
+        own = flat[..., :size]
+        normal[chunk] += np.swapaxes(own, -1, -2) @ own
+        gradient[chunk] += (np.swapaxes(own, -1, -2) @ flat[..., -1:])[..., 0]
+    diagonal = np.einsum("bii->bi", normal)
+    unseen = diagonal == 0
+    diagonal[unseen] = 1.0
+    scale = 1.0 / np.sqrt(diagonal)
+    scaled = normal * scale[:, :, None] * scale[:, None, :]
+    values = np.linalg.eigvalsh(scaled)
+    fixed = values[:, 0] * _MAX_STATION_CONDITION > values[:, -1]
+    step = np.zeros((model.blocks, size))
+    step[fixed] = -(
+        scale[fixed]
+        * np.linalg.solve(scaled[fixed], (scale * gradient)[fixed][..., None])[..., 0]
+    )
+    tangent = xi + step.reshape(-1, width, 6)
+    ok = fixed[:, None] & ~unseen.reshape(-1, width, 6).any(axis=-1)
+    adjoint = triangle_frame(state.markers).inverse().adjoint()
+    index = model.stations.index[ok]
+    order = np.argsort(index)
+    return index[order], (tangent[ok] @ adjoint.T)[order]
