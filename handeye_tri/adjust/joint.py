@@ -8,13 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.adjust.model import (
-    AdjustmentModel,
-    Linearisation,
-    Sides,
-    State,
-    Stations,
-)
+from handeye_tri.adjust.model import AdjustmentModel, Linearisation
+from handeye_tri.adjust.problem import Sides, State, Stations
 from handeye_tri.adjust.result import adjustment_result, check_determined
 from handeye_tri.adjust.robot import RobotParameters, determined
 from handeye_tri.adjust.robust import Loss

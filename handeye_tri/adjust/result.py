@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.adjust.model import AdjustmentModel, Linearisation, State
+from handeye_tri.adjust.model import AdjustmentModel, Linearisation
+from handeye_tri.adjust.problem import State
 from handeye_tri.adjust.robust import apply_loss
 from handeye_tri.calibrate_cameras.least_squares import Minimum
 from handeye_tri.camera import INTRINSIC_NAMES, Intrinsics, Lens, PinholeCamera
