@@ -197,9 +197,27 @@ def _verb(name: str, text: str) -> None:
 
 _verb("simulate", "Execute the plan in the simulator and render every view.")
 _verb("detect", "Find the three markers in every image, with their covariance.")
-_verb("calibrate", "Calibrate the cameras, then the robot's hand-eye relation.")
 _verb("evaluate", "Compare the robot's and the cameras' track at held-out stations.")
 _verb("report", "Write the recording (replay.rrd) and report.html.")
+
+
+@commands.command(epilog=_example("handeye-tri calibrate out --method separate"))
+@_SESSION
+@click.option(
+    "--method",
+    type=click.Choice(["joint", "separate"]),
+    default="joint",
+    show_default=True,
+    help="Adjust cameras, markers and robot together, or step by step as the paper.",
+)
+@_AGAIN
+def calibrate(session: Path, method: str, again: bool) -> None:
+    """Calibrate the cameras and where they and the markers are to the robot."""
+    from handeye_tri.storage import SessionFolder
+
+    folder = SessionFolder.open(session)
+    folder.header["method"] = method
+    _work(folder, ("calibrate",), again=again)
 
 
 @commands.command(epilog=_example("handeye-tri replay out --screenshot out.png"))

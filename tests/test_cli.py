@@ -98,6 +98,13 @@ def test_a_folder_that_holds_something_else_is_left_alone(capsys, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
+def test_calibrate_knows_its_methods(capsys, tmp_path):
+    code, _, err = call(capsys, "calibrate", tmp_path, "--method", "guess")
+    assert code == 2
+    assert "joint" in err
+    assert "separate" in err
+
+
 @pytest.mark.parametrize("verb", ["simulate", "detect", "calibrate", "evaluate"])
 def test_a_verb_on_no_session_says_so(capsys, tmp_path, verb):
     code, _, err = call(capsys, verb, tmp_path / "absent")

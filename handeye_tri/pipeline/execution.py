@@ -21,6 +21,7 @@ class Stage:
         cell_keys: Parts of the cell that it depends on.
         after: Stages whose files it reads.
         run: Does the work; returns the names of the files and the quality line.
+        header_keys: What else of session.json it depends on, beyond the seed.
     """
 
     name: str
@@ -28,6 +29,7 @@ class Stage:
     cell_keys: tuple[str, ...]
     after: tuple[str, ...]
     run: Callable[[Run], tuple[list[str], str]]
+    header_keys: tuple[str, ...] = ()
 
 
 def inputs_of(run: Run, stage: Stage) -> str:
@@ -40,6 +42,7 @@ def inputs_of(run: Run, stage: Stage) -> str:
             "seed": header["seed"],
             "half_turns": header["half_turns"],
             "cell": {key: header["cell"].get(key) for key in stage.cell_keys},
+            **{key: header.get(key) for key in stage.header_keys},
             "model": storage.sha256(run.model_path) if stage.name == "plan" else "",
             "after": {name: run.folder.outputs(name) for name in stage.after},
         }

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from handeye_tri import storage
-from handeye_tri.errors import InputError
+from handeye_tri.errors import InputError, StorageError
 from handeye_tri.records import (
     CameraCalibration,
     GroundTruth,
@@ -32,6 +32,8 @@ TRUTH_SCHEMA = "handeye_tri.truth/1"
 CAMERAS_SCHEMA = "handeye_tri.cameras/1"
 HAND_EYE_SCHEMA = "handeye_tri.hand_eye/1"
 EVALUATION_SCHEMA = "handeye_tri.evaluation/1"
+# How the cell is calibrated: everything together, or step by step.
+METHODS = ("joint", "separate")
 _PACKAGES = (
     "handeye-tri",
     "numpy",
@@ -91,6 +93,7 @@ def start(
             "model_file": str(model),
             "seed": seed,
             "half_turns": cell.plan.half_turns if half_turns is None else half_turns,
+            "method": METHODS[0],
             "simulated": True,
             "stages": {},
         },
@@ -113,6 +116,17 @@ class Run:
     def seed(self) -> int:
         """The seed of everything random."""
         return int(self.folder.header["seed"])
+
+    @property
+    def method(self) -> str:
+        """How the cell is calibrated, one of METHODS."""
+        method = str(self.folder.header.get("method", METHODS[0]))
+        if method not in METHODS:
+            raise StorageError(
+                f"{self.folder.path / 'session.json'}: method must be one of "
+                f"{', '.join(METHODS)}, got {method!r}"
+            )
+        return method
 
     @property
     def model_path(self) -> Path:

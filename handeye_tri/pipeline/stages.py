@@ -146,9 +146,13 @@ def _cameras(run: Run) -> tuple[list[str], str]:
 
 
 def _hand_eye(run: Run) -> tuple[list[str], str]:
+    from handeye_tri.adjust import adjust
     from handeye_tri.hand_eye import calibrate_hand_eye
 
-    result = calibrate_hand_eye(run.session(), run.cameras())
+    session = run.session()
+    result = calibrate_hand_eye(session, run.cameras())
+    if run.method == "joint":
+        result = adjust(session, result)
     storage.write_json(
         run.folder.file("hand_eye.json"),
         {"schema": HAND_EYE_SCHEMA, **codec.hand_eye_to_json(result)},
@@ -156,7 +160,7 @@ def _hand_eye(run: Run) -> tuple[list[str], str]:
     translation = 1e3 * np.sqrt((result.residuals[:, :3] ** 2).sum(axis=1).mean())
     rotation = np.degrees(np.sqrt((result.residuals[:, 3:] ** 2).sum(axis=1).mean()))
     return ["hand_eye.json"], (
-        f"{len(result.residuals)} stations; loop {translation:.3f} mm "
+        f"{run.method}, {len(result.residuals)} stations; loop {translation:.3f} mm "
         f"{rotation:.4f} deg; chi2/dof {result.chi2 / result.dof:.2f}"
     )
 
@@ -198,7 +202,7 @@ def _evaluate(run: Run) -> tuple[list[str], str]:
             "worst_marker": "ABC"[track.markers[worst]],
             "predicted_rms_mm": 1e3 * track.predicted_rms,
             "predicted_parts_mm": {
-                name: 1e3 * value for name, value in asdict(budget).items()
+                name: 1e3 * value for name, value in budget.parts().items()
             },
             "positions": [
                 {
@@ -254,6 +258,7 @@ STAGES = {
             ("rig", "arm"),
             ("plan", "detect", "cameras"),
             _hand_eye,
+            ("method",),
         ),
         Stage(
             "evaluate",

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 
 from handeye_tri.errors import HandEyeError, StorageError
@@ -111,3 +113,13 @@ def test_a_failing_stage_leaves_the_ones_before_it_done(tmp_path, fake):
         work(tmp_path / "s", broken)
     work(tmp_path / "s", fake)
     assert fake.ran == ["second"]
+
+
+def test_a_stage_is_stale_when_what_it_reads_of_the_header_changes(tmp_path, fake):
+    second = replace(fake.stages["second"], header_keys=("method",))
+    fake.stages["second"] = second
+    work(tmp_path / "x", fake)
+    work(tmp_path / "x", fake, method="separate")
+    assert fake.ran == ["first", "second", "second"]
+    work(tmp_path / "x", fake)
+    assert fake.ran == ["first", "second", "second"]

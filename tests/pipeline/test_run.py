@@ -1,7 +1,7 @@
 import pytest
 
 from handeye_tri.errors import InputError, StorageError
-from handeye_tri.pipeline import start
+from handeye_tri.pipeline import Run, start
 
 
 def test_start_writes_nothing_and_knows_what_it_is_about(tmp_path):
@@ -27,3 +27,26 @@ def test_a_session_read_back_after_its_cell_moved_still_knows_it(tmp_path):
         folder.save()
     again = start("hp3_stereo", tmp_path / "out", 7, 5)
     assert again.header == folder.header
+
+
+class Silent:
+    """Progress of nobody."""
+
+    def begin(self, number, total, stage):
+        pass
+
+    def advance(self, done, total):
+        pass
+
+    def end(self, line, seconds):
+        pass
+
+
+def test_a_session_is_calibrated_jointly_unless_it_says_otherwise(tmp_path):
+    folder = start("hp3_stereo", tmp_path / "out", 7, 5)
+    assert Run(folder, Silent()).method == "joint"
+    folder.header["method"] = "separate"
+    assert Run(folder, Silent()).method == "separate"
+    folder.header["method"] = "guess"
+    with pytest.raises(StorageError, match="one of joint, separate, got 'guess'"):
+        _ = Run(folder, Silent()).method
