@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from handeye_tri.calibrate_cameras import (
         calibrate_camera,
+        calibrate_cameras_general,
         calibrate_session_cameras,
     )
     from handeye_tri.camera import Intrinsics, Lens, PinholeCamera, StereoRig
@@ -42,6 +43,7 @@ _HOMES = {
     "TrackEvaluation": "records",
     "TriangleRig": "triangle",
     "calibrate_camera": "calibrate_cameras",
+    "calibrate_cameras_general": "calibrate_cameras",
     "calibrate_hand_eye": "hand_eye",
     "calibrate_session_cameras": "calibrate_cameras",
     "evaluate_track": "evaluate",
@@ -63,6 +65,7 @@ __all__ = [
     "TrackEvaluation",
     "TriangleRig",
     "calibrate_camera",
+    "calibrate_cameras_general",
     "calibrate_hand_eye",
     "calibrate_session_cameras",
     "evaluate_track",

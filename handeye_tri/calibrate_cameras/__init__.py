@@ -3,11 +3,18 @@
 One camera from half-turns of the triangle (Zhao, Liu and Zhang 2008,
 doi:10.1109/TIP.2008.2005562, Sec. III): special_motion (III-A, B, C), homography and
 closed_form (the same constraints, whitened), extrinsics (III-D), refine (III-E),
-degeneracy (III-F). Several cameras: bundle (all of them and the triangle's poses
-adjusted together), eccentricity (of a sphere's outline), session (every step in order).
+degeneracy (III-F). Several cameras from any motions (Appendix A): general_motion, with
+projective, metric_upgrade and focal_sweep for its starts. Several cameras that saw
+half-turns: bundle (all of them and the triangle's poses adjusted together),
+eccentricity (of a sphere's outline), session (every step in order).
 """
 
+from handeye_tri.calibrate_cameras.general_motion import calibrate_cameras_general
 from handeye_tri.calibrate_cameras.session import calibrate_session_cameras
 from handeye_tri.calibrate_cameras.single_camera import calibrate_camera
 
-__all__ = ["calibrate_camera", "calibrate_session_cameras"]
+__all__ = [
+    "calibrate_camera",
+    "calibrate_cameras_general",
+    "calibrate_session_cameras",
+]
