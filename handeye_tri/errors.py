@@ -45,3 +45,7 @@ class MissingDependencyError(HandEyeError, ImportError):
 
 class StorageError(HandEyeError):
     """A session folder or one of its files cannot be read or written."""
+
+
+class WorkerLostError(HandEyeError):
+    """Processes that were given work died, and trying again did not help."""
