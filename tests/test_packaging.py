@@ -27,6 +27,8 @@ HOSTS = [
     "rubygems" + ".org",
 ]
 MIB = 2**20
+# On Windows, and what Dask needs of Pythons before 3.12.
+ONLY_SOMEWHERE = {"colorama", "importlib-metadata", "lazy-importer", "zipp"}
 
 
 @pytest.fixture(scope="module")
