@@ -2,7 +2,8 @@
 
     python scripts/check_cells.py --seeds 1-10 [CELL ...]
 
-Each run is a whole ``handeye-tri run`` in its own process, on rendered images.
+Each run is a whole ``handeye-tri run`` in its own process, on rendered images; then
+the same images are calibrated step by step.
 """
 
 import argparse
@@ -17,23 +18,22 @@ from pathlib import Path
 import numpy as np
 
 CELLS = ("hp3_stereo", "hp3_stereo_edge", "hp3_stereo_lens", "hp3_stereo_mono")
+METHODS = ("separate", "joint")
 
 
-def one(cell: str, seed: int, folder: Path) -> dict[str, float]:
-    started = time.perf_counter()
+def command(*arguments: object) -> None:
     done = subprocess.run(
-        [
-            *(sys.executable, "-m", "handeye_tri.cli", "run", cell),
-            *("-o", str(folder / f"{cell}_{seed}"), "--seed", str(seed)),
-        ],
+        [sys.executable, "-m", "handeye_tri.cli", *map(str, arguments)],
         capture_output=True,
         text=True,
         check=False,
     )
     if done.returncode not in (0, 3, 4):
-        raise SystemExit(f"{cell} seed {seed}: {done.stderr}")
-    path = folder / f"{cell}_{seed}" / "evaluation.json"
-    result = json.loads(path.read_text())
+        raise SystemExit(f"{' '.join(map(str, arguments))}: {done.stderr}")
+
+
+def score(folder: Path) -> dict[str, float]:
+    result = json.loads((folder / "evaluation.json").read_text())
     track, truth = result["track"], result["truth"]
     return {
         "track": track["mean_mm"],
@@ -43,8 +43,35 @@ def one(cell: str, seed: int, folder: Path) -> dict[str, float]:
         "left": truth["left.fx"]["error"] / truth["left.fx"]["sigma"],
         "right": truth["right.fx"]["error"] / truth["right.fx"]["sigma"],
         "passed": float(result["verdict"] == "PASS"),
-        "seconds": time.perf_counter() - started,
     }
+
+
+def one(cell: str, seed: int, folder: Path) -> dict[str, dict[str, float]]:
+    session = folder / f"{cell}_{seed}"
+    started = time.perf_counter()
+    command("run", cell, "-o", session, "--seed", seed)
+    seconds = time.perf_counter() - started
+    scores = {"joint": score(session)}
+    command("calibrate", session, "--method", "separate")
+    command("evaluate", session)
+    scores["separate"] = score(session)
+    for row in scores.values():
+        row["seconds"] = seconds
+    return scores
+
+
+def line(cell: str, method: str, rows: list[dict[str, float]]) -> str:
+    columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    within = [int((np.abs(columns[side]) < 4).sum()) for side in ("left", "right")]
+    n = len(rows)
+    return (
+        f"{cell:<16} {method:<8}{columns['track'].mean():7.3f}"
+        f"{columns['track'].max():7.3f}"
+        f"{np.sqrt((columns['ratio'] ** 2).mean()):8.2f}"
+        f"{columns['chi2'].mean():8.2f}{columns['loop'].mean():7.2f}"
+        f"{within[0]:6d}/{n}{within[1]:4d}/{n}{int(columns['passed'].sum()):5d}/{n}"
+        f"{np.median(columns['seconds']):8.1f}{columns['seconds'].max():6.1f}"
+    )
 
 
 def main() -> None:
@@ -57,10 +84,11 @@ def main() -> None:
     first, last = (int(part) for part in options.seeds.split("-"))
     seeds = range(first, last + 1)
     print(
-        f"seeds {options.seeds}      track mm     rms/      chi2/dof      |fx error| "
-        "< 4 sigma   PASS   seconds\n"
-        "cell                  mean  worst  predicted  cams  loop     left   right"
-        "              median  max"
+        f"seeds {options.seeds:<11}           track mm     rms/    chi2/dof"
+        "     |fx error| < 4 s  PASS  run, seconds\n"
+        "cell             method     mean  worst  predic.  cameras  all"
+        "     left  right         median   max",
+        flush=True,
     )
     with (
         tempfile.TemporaryDirectory() as scratch,
@@ -68,18 +96,9 @@ def main() -> None:
     ):
         folder = options.keep or Path(scratch)
         for cell in options.cells:
-            rows = list(pool.map(lambda s, c=cell: one(c, s, folder), seeds))
-            columns = {k: np.array([row[k] for row in rows]) for k in rows[0]}
-            within = [int((np.abs(columns[k]) < 4).sum()) for k in ("left", "right")]
-            print(
-                f"{cell:<20}{columns['track'].mean():6.3f} {columns['track'].max():6.3f}"
-                f"{np.sqrt((columns['ratio'] ** 2).mean()):11.2f}"
-                f"{columns['chi2'].mean():6.2f}{columns['loop'].mean():6.2f}"
-                f"{within[0]:6d}/{len(rows)}{within[1]:5d}/{len(rows)}"
-                f"{int(columns['passed'].sum()):8d}/{len(rows)}"
-                f"{np.median(columns['seconds']):8.1f}{columns['seconds'].max():6.1f}",
-                flush=True,
-            )
+            runs = list(pool.map(lambda s, c=cell: one(c, s, folder), seeds))
+            for method in METHODS:
+                print(line(cell, method, [run[method] for run in runs]), flush=True)
 
 
 if __name__ == "__main__":
