@@ -1,6 +1,8 @@
 #!/usr/bin/env bash
 # Resolve pyproject.toml into scripts/requirements.txt: every version pinned, every
-# file hashed, no address of an index in it. Needs uv. Extra arguments go to uv:
+# file hashed, no address of an index in it. One version serves all Pythons, so that
+# numbers and types do not depend on which one is there. Needs uv. Extra arguments go
+# to uv:
 #   bash scripts/lock.sh --upgrade
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -10,6 +12,6 @@ if ! command -v uv >/dev/null; then
   exit 2
 fi
 exec uv pip compile pyproject.toml --universal --python-version 3.11 --extra test \
-  --generate-hashes --no-emit-index-url --no-annotate --quiet \
+  --fork-strategy fewest --generate-hashes --no-emit-index-url --no-annotate --quiet \
   --custom-compile-command "bash scripts/lock.sh" \
   --output-file scripts/requirements.txt "$@"
