@@ -24,6 +24,20 @@ def digits(sigma: float) -> int:
     return max(0, 1 - math.floor(math.log10(sigma)))
 
 
+def round_magnification(largest: float, longest: float) -> int:
+    """How many times too long small gaps are drawn: 1, 2, 5, 10, 20, ....
+
+    Args:
+        largest: The largest gap.
+        longest: How long it may be drawn, in the same unit; it is never shortened.
+    """
+    if largest * 1e6 <= longest:
+        return 1_000_000
+    wanted = max(longest / largest, 1.0)
+    power = int(10 ** math.floor(math.log10(wanted)))
+    return max(step * power for step in (1, 2, 5) if step * power <= wanted)
+
+
 def summary_text(
     evaluation: Mapping[str, Any], folder: Path, written: Sequence[str]
 ) -> str:
@@ -149,7 +163,7 @@ def result_rows(
     motions.append(("flange_from_triangle", calibration.flange_from_triangle, true_rig))
     for name, motion, true_motion in motions:
         block = covariance.block(motion_labels(name))
-        rows += _motion_rows(name, motion, block, true_motion)
+        rows += motion_rows(name, motion, block, true_motion)
     return rows
 
 
@@ -175,7 +189,7 @@ def _parameter(camera: PinholeCamera, quantity: str) -> float:
     return float(camera.lens.coefficients[names.index(quantity)])
 
 
-def _motion_rows(
+def motion_rows(
     name: str, motion: SE3, covariance: Floats, truth: SE3 | None
 ) -> list[dict[str, Any]]:
     """Six rows of a motion whose right tangent has this covariance, (6, 6)."""

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
-from handeye_tri.evaluate import evaluate_track
+from handeye_tri.diagnose import assess
+from handeye_tri.evaluate import evaluate_track, track_budget
 from handeye_tri.hand_eye import calibrate_hand_eye
 from handeye_tri.mechanism import Body, Geometry, Joint, Mechanism, Shape
 from handeye_tri.records import (
@@ -21,6 +23,7 @@ from handeye_tri.records import (
     TrackEvaluation,
 )
 from handeye_tri.se3 import SE3
+from handeye_tri.summary import result_rows
 from handeye_tri.synthesize import reference_geometry, synthesize
 from handeye_tri.triangle import Axis
 
@@ -126,3 +129,45 @@ def photograph(camera: str, station: int) -> NDArray[np.uint8]:
     ramp = np.linspace(60, 200, 1024, dtype=np.uint8)
     row = np.roll(ramp, 40 * station + len(camera))
     return np.repeat(np.tile(row, (768, 1))[..., None], 3, axis=2)
+
+
+def evaluation(done: Finished) -> dict[str, Any]:
+    """What evaluation.json holds."""
+    track, budget = done.track, track_budget(done.calibration, done.session)
+    verdict = assess(
+        *(done.session, done.cameras, done.calibration, track),
+        track_limit=1e-3,
+        min_plane_spread=float(np.radians(20)),
+    )
+    worst = int(np.argmax(track.distances))
+    return {
+        "verdict": verdict.outcome,
+        "sentence": verdict.sentence,
+        "nearest": verdict.nearest,
+        "simulated": True,
+        "gates": [asdict(gate) for gate in verdict.gates],
+        "findings": [asdict(finding) for finding in verdict.findings],
+        "track": {
+            "stations": len(set(track.stations.tolist())),
+            "mean_mm": 1e3 * track.mean,
+            "rms_mm": 1e3 * track.rms,
+            "max_mm": 1e3 * track.max,
+            "worst_station": int(track.stations[worst]),
+            "worst_marker": "ABC"[track.markers[worst]],
+            "predicted_rms_mm": 1e3 * track.predicted_rms,
+            "predicted_parts_mm": {
+                name: 1e3 * value for name, value in budget.parts().items()
+            },
+            "positions": [
+                {
+                    "station": int(track.stations[r]),
+                    "marker": "ABC"[track.markers[r]],
+                    "reported_m": track.reported[r].tolist(),
+                    "observed_m": track.observed[r].tolist(),
+                    "error_mm": 1e3 * float(track.distances[r]),
+                }
+                for r in range(len(track.stations))
+            ],
+        },
+        "result": result_rows(done.calibration, done.truth),
+    }

@@ -6,7 +6,7 @@ import pytest
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
 from handeye_tri.hand_eye import calibrate_hand_eye
 from handeye_tri.records import Repeatability
-from handeye_tri.summary import digits, result_rows, summary_text
+from handeye_tri.summary import digits, result_rows, round_magnification, summary_text
 from handeye_tri.synthesize import reference_geometry, synthesize
 
 REPEATABILITY = Repeatability(3e-5, float(np.radians(0.005)))
@@ -105,3 +105,11 @@ def test_findings_are_told_with_what_to_do(calibrated):
     text = summary_text(evaluation(calibrated, findings=[finding]), Path("out"), [])
     assert "SCALE: metres differ; 1.01" in text
     assert "Do: measure again." in text
+
+
+@pytest.mark.parametrize(
+    ("largest", "expected"),
+    [(1e-4, 1000), (1.3e-4, 500), (0.06, 2), (1.0, 1), (0.0, 1_000_000)],
+)
+def test_gaps_are_drawn_round_times_too_long_within_the_limit(largest, expected):
+    assert round_magnification(largest, 0.12) == expected

@@ -7,18 +7,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
 from handeye_tri.camera import PinholeCamera
 from handeye_tri.errors import InputError
 from handeye_tri.evaluate import evaluate_track
+from handeye_tri.evaluate.views import predicted_pixels
 from handeye_tri.records import (
     GroundTruth,
     HandEyeCalibration,
     Session,
     TrackEvaluation,
 )
+from handeye_tri.summary import round_magnification
 from handeye_tri.triangle import EDGES, Axis
 
 Floats = NDArray[np.float64]
@@ -135,9 +136,11 @@ def tell(
             reported[rows.stations, rows.markers] = rows.reported
     actual = None
     if truth is not None:
-        markers = truth.flange_from_triangle.apply(session.triangle.points)
+        markers = truth.markers
+        if markers is None:
+            markers = truth.flange_from_triangle.apply(session.triangle.points)
         actual = _move(truth.base_from_flange, markers)
-    predicted = _predict(session, calibration, reported)
+    predicted = predicted_pixels(calibration, session)
     return Story(
         held_out=held_out,
         reported=reported,
@@ -148,10 +151,8 @@ def tell(
             _half_turns(session, i, camera)
             for i, camera in enumerate(calibration.cameras)
         ),
-        magnification=round_magnification(observed - reported, _LONGEST_ARROW),
-        magnification_px=round_magnification(
-            session.pixels - predicted, _LONGEST_ARROW_PX
-        ),
+        magnification=_magnification(observed - reported, _LONGEST_ARROW),
+        magnification_px=_magnification(session.pixels - predicted, _LONGEST_ARROW_PX),
     )
 
 
@@ -175,20 +176,6 @@ def _used_track(
         return None
     swapped = replace(session, stations=stations, half_turns=())
     return evaluate_track(calibration, swapped)
-
-
-def _predict(
-    session: Session, calibration: HandEyeCalibration, reported: Floats
-) -> Floats:
-    """Centres of the markers' outlines in every view, shape (m, n, 3, 2)."""
-    views = []
-    for camera, motion in zip(
-        calibration.cameras, calibration.base_from_camera, strict=True
-    ):
-        local = motion.inverse().apply(reported)
-        shift = sphere_shift(camera, local, session.marker_radii)
-        views.append(camera.project(local) + shift)
-    return np.array(views)
 
 
 def _half_turns(
@@ -240,21 +227,10 @@ def _meeting_point(pairs: Floats) -> Floats:
     return np.asarray(np.linalg.lstsq(normal, offset)[0])
 
 
-def round_magnification(gaps: ArrayLike, longest: float) -> int:
-    """Largest of 1, 2, 5, 10, 20, ... by which no gap gets longer than asked.
-
-    Args:
-        gaps: Shape (..., d); NaN is left out.
-        longest: The longest that a gap may be drawn, in the gaps' unit.
-    """
-    lengths = np.linalg.norm(np.asarray(gaps, dtype=float), axis=-1)
-    largest = float(np.nanmax(lengths, initial=0.0))
-    if largest * 1e6 <= longest:
-        return 1_000_000
-    wanted = max(longest / largest, 1.0)
-    power = int(10 ** np.floor(np.log10(wanted)))
-    steps = [step * power for step in (1, 2, 5)]
-    return max(step for step in steps if step <= wanted)
+def _magnification(gaps: Floats, longest: float) -> int:
+    """By how much gaps, shape (..., d) with NaN left out, are drawn too long."""
+    lengths = np.linalg.norm(gaps, axis=-1)
+    return round_magnification(float(np.nanmax(lengths, initial=0.0)), longest)
 
 
 def worst_station(track: TrackEvaluation) -> int:

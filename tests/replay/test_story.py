@@ -12,7 +12,6 @@ from handeye_tri.replay.shapes import vertex_normals
 from handeye_tri.replay.story import (
     HalfTurnView,
     _half_turn,
-    round_magnification,
     tell,
     verdict_markdown,
     worst_station,
@@ -119,19 +118,6 @@ def test_a_track_of_another_session_is_refused():
     other = replace(done.track, stations=np.zeros_like(done.track.stations))
     with pytest.raises(InputError, match="does not hold out"):
         tell(done.session, done.calibration, other, None)
-
-
-@pytest.mark.parametrize(
-    ("gap", "longest", "expected"),
-    [(1e-4, 0.12, 1000), (1.3e-4, 0.12, 500), (0.06, 0.12, 2), (1.0, 0.12, 1)],
-)
-def test_magnification_is_round_and_within_the_limit(gap, longest, expected):
-    gaps = np.array([[gap, 0, 0], [0.5 * gap, 0, 0], [np.nan] * 3])
-    assert round_magnification(gaps, longest) == expected
-
-
-def test_magnification_of_nothing_is_finite():
-    assert round_magnification(np.zeros((4, 3)), 0.1) == 1_000_000
 
 
 def test_far_tracks_are_the_gaps_magnified():
