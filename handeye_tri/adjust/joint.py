@@ -287,6 +287,7 @@ def _with_bending(
             cameras[i].image_size,
             Lens(cameras[i].lens.model, state.lenses[i]),
         )
+        local = np.moveaxis(local, 0, -1)
         axial = local.copy()
         axial[..., 2] -= model.radii**2 / local[..., 2]
         whole = camera.project(local) + sphere_shift(camera, local, model.radii)

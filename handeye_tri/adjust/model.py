@@ -16,15 +16,24 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri.adjust.derivatives import (
+    bent_rays,
+    by_unknowns,
+    in_camera,
+    marker_points,
+)
 from handeye_tri.adjust.equations import ChunkedEquations, chunks
 from handeye_tri.adjust.problem import Sides, State, Stations
 from handeye_tri.adjust.robot import RobotParameters, right_jacobian
 from handeye_tri.adjust.robust import Loss, apply_loss
-from handeye_tri.camera import distort, project_jacobians
-from handeye_tri.se3 import hat, se3_adjoint, se3_exp, se3_inverse
+from handeye_tri.camera import distort
+from handeye_tri.se3 import se3_adjoint, se3_exp, se3_inverse
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+
+# By fx, fy, skew, cx, cy: which pixel coordinate moves, by which part of the ray.
+_INTRINSICS = ((0, 0), (1, 1), (0, 1), (0, None), (1, None))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,35 +146,38 @@ class AdjustmentModel:
         return np.asarray(units @ self.root.T)
 
     def views(self, state: State) -> Iterator[tuple[slice, int, Bools, Floats]]:
-        """Chunk of blocks, camera, what it sees (c, w, 3), and where (c, w, 3, 3).
+        """Chunk of blocks, camera, what it sees (c, w, 3), and where (3, c, w, 3).
 
-        Positions are in the camera's frame, metres; on its axis where unseen.
+        Positions are x, y, z in the camera's frame, metres; on its axis where unseen.
         """
         poses, _ = self.robot_poses(state)
         for chunk in chunks(self.blocks):
             executed = poses[chunk] @ se3_exp(self.missed(state, chunk))
-            points = _points(executed, state.markers)
+            points = marker_points(executed, state.markers)
             for i in range(len(self.columns)):
                 seen = self.seen[i, chunk]
-                yield chunk, i, seen, self._local(state, i, points, seen)
+                yield (
+                    chunk,
+                    i,
+                    seen,
+                    in_camera(state.base_from_camera[i], points, seen),
+                )
 
-    def _local(self, state: State, i: int, points: Floats, seen: Bools) -> Floats:
-        """Markers in the frame of camera i, (c, w, 3, 3); on its axis where unseen."""
-        camera = state.base_from_camera[i]
-        local = (points - camera[:3, 3]) @ camera[:3, :3]
-        return np.where(seen[..., None], local, (0.0, 0.0, 1.0))
-
-    def predicted(self, state: State, i: int, local: Floats, chunk: slice) -> Floats:
-        """Centres of the markers' outlines, (c, w, 3, 2), pixels.
+    def _outline_depth(self, depth: Floats) -> Floats:
+        """Depth at which the centre of a sphere's outline is projected, (..., 3).
 
         The outline of a sphere at (X, Y, Z) has its centre where (X, Y, Z - r^2 / Z)
         projects, exactly so without a lens.
         """
-        depth = local[..., 2] - self.radii**2 / local[..., 2]
-        xy = local[..., :2] / depth[..., None]
+        return np.asarray(depth - self.radii**2 / depth)
+
+    def predicted(self, state: State, i: int, local: Floats, chunk: slice) -> Floats:
+        """Centres of the markers' outlines, (c, w, 3, 2), pixels, from (3, c, w, 3)."""
+        xy = np.moveaxis(local[:2] / self._outline_depth(local[2]), 0, -1)
         fx, fy, skew, cx, cy = state.intrinsics[i]
         bent = distort(state.lenses[i], xy) if state.lenses[i].any() else xy
-        pixels = bent @ np.array([[fx, 0.0], [skew, fy]]) + (cx, cy)
+        pixels = bent.reshape(-1, 2) @ np.array([[fx, 0.0], [skew, fy]]) + (cx, cy)
+        pixels = pixels.reshape(bent.shape)
         if self.stations.bending is not None:
             pixels = pixels + self.stations.bending[i, chunk]
         return np.asarray(pixels)
@@ -186,7 +198,7 @@ class AdjustmentModel:
             return None
         cost = self.prior_cost(state)
         for chunk, i, seen, local in self.views(state):
-            if (local[..., 2] <= self.radii).any():
+            if (local[2] <= self.radii).any():
                 return None
             missed = self.predicted(state, i, local, chunk)
             missed -= self.stations.pixels[i, chunk]
@@ -235,7 +247,6 @@ class AdjustmentModel:
             (c, w, 3, 2, own + s + 1): by own and those shared unknowns, residual last.
         """
         poses, by_robot = self.robot_poses(state)
-        by_rig = _by_rig(state.markers, self.sides.exact)
         tail = np.arange(self.rig.start, self.shared)
         for chunk in chunks(self.blocks):
             xi = self.missed(state, chunk)
@@ -243,63 +254,79 @@ class AdjustmentModel:
             executed = poses[chunk] @ step
             back = se3_adjoint(se3_inverse(step)) @ by_robot[chunk]
             tangents = np.concatenate([right_jacobian(xi) @ self.root, back], axis=-1)
-            points = _points(executed, state.markers)
-            by_shared = _by_unknowns(
-                executed, state.markers, tangents, by_rig, self.root.shape[1]
+            points = marker_points(executed, state.markers)
+            by_shared = by_unknowns(
+                executed, state.markers, tangents, self.root.shape[1], self.sides.exact
             )
             for i, columns in enumerate(self.columns):
                 seen = self.seen[i, chunk]
-                rows = self._camera_rows(state, i, chunk, points, by_shared, seen)
-                yield (
-                    chunk,
-                    i,
-                    np.r_[columns, tail],
-                    self._mixed(rows, chunk, seen),
-                )
+                local = in_camera(state.base_from_camera[i], points, seen)
+                rows = self._camera_rows(state, i, chunk, local, by_shared)
+                yield chunk, i, np.r_[columns, tail], self._mixed(rows, chunk, seen)
 
     def _camera_rows(
-        self,
-        state: State,
-        i: int,
-        chunk: slice,
-        points: Floats,
-        by_shared: Floats,
-        seen: Bools,
+        self, state: State, i: int, chunk: slice, local: Floats, by_shared: Floats
     ) -> Floats:
-        """Rows of one camera, (c, w, 3, 2, q), see :meth:`rows`."""
-        size = self.root.shape[1]
-        local = self._local(state, i, points, seen)
-        axial = local.copy()
-        axial[..., 2] -= self.radii**2 / local[..., 2]
-        predicted, by_point, by_inner, by_lens = project_jacobians(
-            state.intrinsics[i], state.lenses[i], axial
-        )
-        by_point[..., 2] *= (1.0 + (self.radii / local[..., 2]) ** 2)[..., None]
+        """Rows of one camera, (c, w, 3, 2, q), see :meth:`rows`.
+
+        Components come first in here, (2, ..., c, w, 3): sums over 2 or 3 components
+        of long arrays cost a fraction of as many small matrix products.
+        """
+        size, width = self.root.shape[1], self.stations.index.shape[1]
+        inner, free = list(self.intrinsics[i]), list(self.lenses[i])
+        depth = self._outline_depth(local[2])
+        xy = local[:2] / depth
+        bent, by_xy, by_lens = bent_rays(state.lenses[i], xy, free)
+        fx, fy, skew, cx, cy = state.intrinsics[i]
+        by_xy = np.stack([fx * by_xy[0] + skew * by_xy[1], fy * by_xy[1]])
+        by_point = np.empty((2, 3, *depth.shape))
+        by_point[:, :2] = by_xy / depth
+        by_point[:, 2] = -(by_point[:, 0] * xy[0] + by_point[:, 1] * xy[1])
+        by_point[:, 2] *= 1.0 + (self.radii / local[2]) ** 2
+        whitener = np.moveaxis(self.stations.whitener[i, chunk], (-2, -1), (0, 1))
+
+        def white(pair: Floats) -> Floats:
+            """Whiten (2, k, ...) along its first axis."""
+            return np.asarray(whitener[:, :1] * pair[0] + whitener[:, 1:] * pair[1])
+
+        by_point = white(by_point)
+        turned = state.base_from_camera[i, :3, :3]
+        by_base = (turned @ by_point.reshape(2, 3, -1)).reshape(by_point.shape)
+        moved = np.moveaxis(by_base, (0, 1), (-2, -1)) @ by_shared
+        tail = moved.shape[-1] - size
+        start = width * size
+        count = start + len(inner) + len(free) + 6 + tail + 1
+        rows = np.zeros((*depth.shape, 2, count))
+        for station in range(width):
+            own = slice(station * size, (station + 1) * size)
+            rows[:, station, ..., own] = moved[:, station, ..., :size]
+        column = np.moveaxis(rows, (-2, -1), (0, 1))
+        # By fx, fy, skew, cx, cy: pixels are K times the bent ray.
+        for k in inner:
+            of_row, factor = _INTRINSICS[k]
+            column[:, start] = whitener[:, of_row]
+            if factor is not None:
+                column[:, start] *= bent[factor]
+            start += 1
+        if by_lens is not None:
+            upper = np.stack([fx * by_lens[0] + skew * by_lens[1], fy * by_lens[1]])
+            column[:, start : start + len(free)] = white(upper)
+            start += len(free)
+        column[:, start : start + 3] = -by_point
+        # A row b of derivatives by the point turns into b x p.
+        for k in range(3):
+            one, two = (k + 1) % 3, (k + 2) % 3
+            column[:, start + 3 + k] = (
+                by_point[:, one] * local[two] - by_point[:, two] * local[one]
+            )
+        start += 6
+        rows[..., start : start + tail] = moved[..., size:]
+        predicted = np.stack([fx * bent[0] + skew * bent[1] + cx, fy * bent[1] + cy])
+        missed = predicted - np.moveaxis(self.stations.pixels[i, chunk], -1, 0)
         if self.stations.bending is not None:
-            predicted = predicted + self.stations.bending[i, chunk]
-        whitener = self.stations.whitener[i, chunk]
-        by_point = whitener @ by_point
-        by_base = by_point @ state.base_from_camera[i, :3, :3].T
-        moved = by_base @ by_shared
-        inner, lens = list(self.intrinsics[i]), list(self.lenses[i])
-        own = moved[..., :size]
-        if self.stations.index.shape[1] == 2:
-            own = np.zeros((*moved.shape[:-1], 2 * size))
-            own[:, 0, ..., :size] = moved[:, 0, ..., :size]
-            own[:, 1, ..., size:] = moved[:, 1, ..., :size]
-        missed = predicted - self.stations.pixels[i, chunk]
-        return np.concatenate(
-            [
-                own,
-                whitener @ by_inner[..., inner],
-                whitener @ by_lens[..., lens],
-                -by_point,
-                by_point @ hat(local),
-                moved[..., size:],
-                whitener @ missed[..., None],
-            ],
-            axis=-1,
-        )
+            missed += np.moveaxis(self.stations.bending[i, chunk], -1, 0)
+        column[:, -1] = white(missed[:, None])[:, 0]
+        return rows
 
     def equations(self, state: State) -> ChunkedEquations:
         """Normal equations at a state, in arrays that the next call fills anew."""
@@ -365,40 +392,3 @@ class AdjustmentModel:
             state.robot + shared[self.rig.stop :],
             state.missed + own,
         )
-
-
-def _points(executed: Floats, markers: Floats) -> Floats:
-    """Markers in the base, shape (c, w, 3, 3), metres."""
-    rotation = np.swapaxes(executed[..., :3, :3], -1, -2)
-    return np.asarray(markers @ rotation + executed[..., None, :3, 3])
-
-
-def _by_rig(markers: Floats, exact: bool) -> Floats:
-    """Derivative of each marker in the flange by the rig's unknowns, (3, 3, 6 or 9)."""
-    if exact:
-        eye = np.broadcast_to(np.eye(3), (3, 3, 3))
-        return np.concatenate([eye, -hat(markers)], axis=-1)
-    return np.asarray(np.eye(9).reshape(3, 3, 9))
-
-
-def _by_unknowns(
-    executed: Floats, markers: Floats, tangents: Floats, by_rig: Floats, own: int
-) -> Floats:
-    """Derivative of the markers in the base by all but the cameras.
-
-    Args:
-        executed: base_from_flange, (c, w, 4, 4).
-        markers: In the flange, (3, 3).
-        tangents: Derivative of the flange's right tangent by l own unknowns and p
-            parameters of the robot, (c, w, 6, l + p).
-        by_rig: Derivative of the markers by r unknowns, (3, 3, r).
-        own: The number l.
-
-    Returns:
-        By own unknowns, the rig's, the robot's: shape (c, w, 3, 3, l + r + p).
-    """
-    rotation = executed[..., None, :3, :3]
-    moved = tangents[..., None, :3, :] - hat(markers) @ tangents[..., None, 3:, :]
-    rig = np.broadcast_to(by_rig, (*executed.shape[:2], *by_rig.shape))
-    whole = np.concatenate([moved[..., :own], rig, moved[..., own:]], axis=-1)
-    return np.asarray(rotation @ whole)

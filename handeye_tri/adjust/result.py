@@ -27,6 +27,8 @@ Floats = NDArray[np.float64]
 
 # Scaled information worse conditioned than this is singular in double precision.
 _MAX_CONDITION = 1e13
+# What has a smaller part in an undetermined direction is not named for it.
+_SHARE = 0.01
 # A station's own six equations worse conditioned than this do not fix the flange.
 _MAX_STATION_CONDITION = 1e12
 
@@ -64,13 +66,17 @@ def check_determined(
         )
     scale = 1.0 / np.sqrt(diagonal)
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    if values[0] * _MAX_CONDITION < values[-1]:
-        weak = np.argsort(-np.abs(vectors[:, 0]))[:4]
+    open_ = vectors[:, values * _MAX_CONDITION < values[-1]]
+    if open_.size:
+        share: dict[str, float] = {}
+        for label, weight in zip(labels, (open_**2).sum(axis=1), strict=True):
+            owner = label.rsplit(".", 1)[0]
+            share[owner] = share.get(owner, 0.0) + float(weight)
+        owners = [name for name, weight in share.items() if weight > _SHARE]
         raise DegenerateMotionError(
-            f"the data do not determine all {len(labels)} unknowns together: "
-            f"{', '.join(labels[k] for k in weak)} trade against each other "
-            f"(condition {values[-1] / max(values[0], 1e-300):.2g}); turn the flange "
-            "about two or more axes by at least 20 degrees, or estimate fewer unknowns"
+            f"the data leave {open_.shape[1]} of {len(labels)} unknowns open: "
+            f"{', '.join(owners)} trade against each other; turn the flange about "
+            "two or more axes by at least 20 degrees, or estimate fewer unknowns"
         )
     return float(values[-1] / values[0])
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from handeye_tri.errors import InputError
 from handeye_tri.records import MOTION_QUANTITIES, locked
-from handeye_tri.se3 import se3_adjoint, se3_exp, se3_left_jacobian_inverse
+from handeye_tri.se3 import se3_adjoint, se3_exp, se3_left_jacobian
 
 Floats = NDArray[np.float64]
 # From parameters (p,): base_from_flange (n, 4, 4) and the derivative of its right
@@ -127,7 +127,7 @@ class RobotParameters:
 
 def right_jacobian(tangent: Floats) -> Floats:
     """``exp(x + d) ~ exp(x) exp(J d)``, shape (..., 6, 6), of tangents x, (..., 6)."""
-    return np.asarray(np.linalg.inv(se3_left_jacobian_inverse(-tangent)))
+    return se3_left_jacobian(-tangent)
 
 
 def joint_offsets(

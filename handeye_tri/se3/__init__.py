@@ -10,6 +10,7 @@ from handeye_tri.se3.motions import (
     se3_adjoint,
     se3_exp,
     se3_inverse,
+    se3_left_jacobian,
     se3_left_jacobian_inverse,
     se3_log,
 )
@@ -33,6 +34,7 @@ __all__ = [
     "se3_adjoint",
     "se3_exp",
     "se3_inverse",
+    "se3_left_jacobian",
     "se3_left_jacobian_inverse",
     "se3_log",
     "so3_exp",

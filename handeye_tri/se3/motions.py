@@ -82,6 +82,25 @@ def se3_inverse(matrix: ArrayLike) -> Floats:
     return result
 
 
+def se3_left_jacobian(tangent: ArrayLike) -> Floats:
+    """Left Jacobian of SE(3): ``exp(x + d) ~ exp(J d) exp(x)``.
+
+    The right one, ``exp(x + d) ~ exp(x) exp(J d)``, is this at ``-x``. Formulas:
+    Barfoot 2017, Eq. 7.85 and 7.86, for tangents (translation, rotation).
+
+    Args:
+        tangent: Shape (..., 6), metres and radians.
+
+    Returns:
+        Shape (..., 6, 6).
+    """
+    xi = np.asarray(tangent, dtype=float)
+    result = np.zeros((*xi.shape[:-1], 6, 6))
+    result[..., :3, :3] = result[..., 3:, 3:] = so3_left_jacobian(xi[..., 3:])
+    result[..., :3, 3:] = _coupling(xi)
+    return result
+
+
 def se3_left_jacobian_inverse(tangent: ArrayLike) -> Floats:
     """Inverse of the left Jacobian of SE(3).
 
@@ -95,6 +114,15 @@ def se3_left_jacobian_inverse(tangent: ArrayLike) -> Floats:
         Shape (..., 6, 6).
     """
     xi = np.asarray(tangent, dtype=float)
+    inverse = so3_left_jacobian_inverse(xi[..., 3:])
+    result = np.zeros((*xi.shape[:-1], 6, 6))
+    result[..., :3, :3] = result[..., 3:, 3:] = inverse
+    result[..., :3, 3:] = -inverse @ _coupling(xi) @ inverse
+    return result
+
+
+def _coupling(xi: Floats) -> Floats:
+    """How rotation moves translation in the left Jacobian, shape (..., 3, 3)."""
     rho, phi = hat(xi[..., :3]), hat(xi[..., 3:])
     angle = np.linalg.norm(xi[..., 3:], axis=-1)
     square = angle * angle
@@ -113,17 +141,12 @@ def se3_left_jacobian_inverse(tangent: ArrayLike) -> Floats:
     )
     phi_rho, rho_phi = phi @ rho, rho @ phi
     phi_rho_phi = phi_rho @ phi
-    coupling = (
+    return np.asarray(
         0.5 * rho
         + first[..., None, None] * (phi_rho + rho_phi + phi_rho_phi)
         + second[..., None, None] * (phi @ phi_rho + rho_phi @ phi - 3 * phi_rho_phi)
         + third[..., None, None] * (phi_rho_phi @ phi + phi @ phi_rho_phi)
     )
-    inverse = so3_left_jacobian_inverse(xi[..., 3:])
-    result = np.zeros((*xi.shape[:-1], 6, 6))
-    result[..., :3, :3] = result[..., 3:, 3:] = inverse
-    result[..., :3, 3:] = -inverse @ coupling @ inverse
-    return result
 
 
 def se3_adjoint(matrix: ArrayLike) -> Floats:

@@ -17,6 +17,7 @@ from handeye_tri.se3 import (
     se3_adjoint,
     se3_exp,
     se3_inverse,
+    se3_left_jacobian,
     se3_left_jacobian_inverse,
     se3_log,
     so3_exp,
@@ -124,6 +125,14 @@ def test_left_jacobian_inverse_is_the_derivative_of_log(angle: float) -> None:
         minus = se3_log(se3_exp(-step) @ se3_exp(x))
         numeric[:, i] = (plus - minus) / (2 * h)
     assert np.abs(numeric - se3_left_jacobian_inverse(x)).max() < 2e-9
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.39, 0.41, 2.0, 3.1])
+def test_left_jacobian_undoes_its_inverse(angle: float) -> None:
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    x = np.concatenate([[0.3, -0.2, 0.5], angle * axis])
+    product = se3_left_jacobian(x) @ se3_left_jacobian_inverse(x)
+    assert np.abs(product - np.eye(6)).max() < 1e-12
 
 
 def test_left_jacobian_inverse_at_pi_continues_the_one_below() -> None:
