@@ -59,7 +59,7 @@ class ClosedForm:
 def closed_form(
     data: HalfTurnData,
     homographies: Homographies,
-    skew: bool,
+    basis: Floats,
     method: ClosedFormMethod,
 ) -> ClosedForm:
     """Solve for K, then for the poses (Sec. III-D).
@@ -67,7 +67,7 @@ def closed_form(
     Args:
         data: The half-turns.
         homographies: Their homographies.
-        skew: Whether K has a skew factor; else zero skew is imposed.
+        basis: Of the b to choose from, shape (6, k); see :func:`solve_conic`.
         method: "whitened" or "paper".
 
     Raises:
@@ -79,7 +79,7 @@ def closed_form(
         seen = homogeneous(image.normalised(data.pixels))
         args = (data.triangle, data.axes)
         rows = constraint_rows(seen[:, 0], seen[:, 1], *args)
-        b, _, inverse = solve_conic(rows.reshape(-1, 6), skew)
+        b, _, inverse = solve_conic(rows.reshape(-1, 6), basis)
         spread = _paper_row_covariance(data, homographies, b)
         z = depths(seen[:, 0], seen[:, 1], *args)
     else:
@@ -88,7 +88,7 @@ def closed_form(
         for _ in range(2):
             factor = np.linalg.cholesky(constraint_covariance(homographies, b))
             whitened = np.linalg.solve(factor, rows)
-            b, _, inverse = solve_conic(whitened.reshape(-1, 6), skew)
+            b, _, inverse = solve_conic(whitened.reshape(-1, 6), basis)
         by_half_turn = inverse.reshape(6, -1, 2)
         inverse = np.einsum("bnr,nrs->bns", by_half_turn, np.linalg.inv(factor))
         spread = constraint_covariance(homographies, b)

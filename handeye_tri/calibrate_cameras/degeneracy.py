@@ -41,27 +41,27 @@ _MAX_CONDITION = 1e13
 _LEAST_NOISE_PX = 1e-3
 
 
-def check_count(n: int, skew: bool, unknowns: int, per_half_turn: int) -> None:
+def check_count(n: int, intrinsics: int, unknowns: int, per_half_turn: int) -> None:
     """Refuse fewer half-turns than unknowns need (Sec. III-C).
 
     Args:
         n: Complete half-turns.
-        skew: Whether skew is estimated.
+        intrinsics: How many of the five are estimated.
         unknowns: Shared unknowns: intrinsics, lens coefficients, a shared O.
         per_half_turn: Observations of a half-turn less its own unknowns.
 
     Raises:
         DegenerateMotionError: says how many there are and how many are needed.
     """
-    needed = max(3 if skew else 2, unknowns // per_half_turn + 1)
+    needed = max((intrinsics + 1) // 2, unknowns // per_half_turn + 1)
     if n < needed:
         remedy = "add half-turns about other planes"
-        if skew and n == 2 and unknowns - 1 < n * per_half_turn:
+        if intrinsics == 5 and n == 2 and unknowns - 1 < n * per_half_turn:
             remedy += ", or fix the skew at zero (skew=False), for which 2 are enough"
         raise DegenerateMotionError(
             f"{n} half-turns are too few for {unknowns} unknowns of camera and axis"
-            f"{' with skew' if skew else ''}: at least {needed} are needed, because "
-            f"each gives 2 constraints on K; {remedy}"
+            f"{' with skew' if intrinsics == 5 else ''}: at least {needed} are needed, "
+            f"because each gives 2 constraints on K; {remedy}"
         )
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from handeye_tri.calibrate_cameras.half_turns import HalfTurnData
 from handeye_tri.calibrate_cameras.homography import OMode
+from handeye_tri.calibrate_cameras.intrinsic_choice import IntrinsicChoice
 from handeye_tri.calibrate_cameras.least_squares import Blocks, Minimum, minimise
 from handeye_tri.camera import distort_jacobians
 from handeye_tri.se3 import hat, so3_exp, so3_left_jacobian
@@ -56,14 +57,14 @@ class HalfTurnModel:
 
     Own unknowns of a half-turn, in order: pose (6, right perturbation, rotation and
     translation apart), O if free (2), turn in units of its prior (6). Shared:
-    intrinsics (fx, fy, skew if estimated, cx, cy), lens coefficients, O if shared.
+    intrinsics (fx, fy, skew, cx, cy: those estimated), lens coefficients, O if shared.
     """
 
     def __init__(
         self,
         data: HalfTurnData,
         *,
-        skew: bool,
+        choice: IntrinsicChoice,
         lens: tuple[int, ...],
         o_mode: OMode,
         turn_covariance: Floats | None,
@@ -72,14 +73,14 @@ class HalfTurnModel:
 
         Args:
             data: The half-turns.
-            skew: Whether the skew factor is estimated.
+            choice: Which intrinsics are estimated.
             lens: Indices of the lens coefficients that are estimated.
             o_mode: How O is treated; without a normal axis it plays no part.
             turn_covariance: Shape (n, 6, 6), m and rad, positive semi-definite;
                 None for exact half-turns.
         """
         self.data = data
-        self.intrinsics = (0, 1, 2, 3, 4) if skew else (0, 1, 3, 4)
+        self.choice = choice
         self.lens = lens
         has_o = o_mode != "known" and bool(data.about_normal.any())
         self.shared_o = has_o and o_mode == "shared"
@@ -93,7 +94,7 @@ class HalfTurnModel:
     @property
     def camera_unknowns(self) -> int:
         """Number of intrinsics and lens coefficients that are estimated."""
-        return len(self.intrinsics) + len(self.lens)
+        return len(self.choice.names) + len(self.lens)
 
     @property
     def own_unknowns(self) -> int:
@@ -198,14 +199,14 @@ class HalfTurnModel:
             columns[:, 1, ..., at : at + 2] = by_point[:, 1, ..., :2] * reach
         if by_turn is not None:
             columns[:, 1, ..., size - 6 : size] = by_point[:, 1] @ by_turn
-        columns[..., 0, size] = xy[..., 0]
-        columns[..., 1, size + 1] = xy[..., 1]
-        columns[..., 0, size + len(self.intrinsics) - 2] = 1.0
-        columns[..., 1, size + len(self.intrinsics) - 1] = 1.0
-        if 2 in self.intrinsics:
-            columns[..., 0, size + 2] = xy[..., 1]
+        inner = len(self.choice.names)
+        by_inner = np.zeros((n, 2, 3, 2, 5))
+        by_inner[..., 0, 0], by_inner[..., 1, 1] = xy[..., 0], xy[..., 1]
+        by_inner[..., 0, 2] = xy[..., 1]
+        by_inner[..., 0, 3] = by_inner[..., 1, 4] = 1.0
+        columns[..., size : size + inner] = by_inner @ self.choice.basis
         if self.lens:
-            start = size + len(self.intrinsics)
+            start = size + inner
             columns[..., start : size + count] = upper @ by_lens[..., self.lens]
         columns[..., -1] = xy @ upper.T + (cx, cy) - self.data.pixels
         rows = (self.data.whitener @ columns).reshape(n, 12, -1)
@@ -221,9 +222,9 @@ class HalfTurnModel:
         poses = state.poses.copy()
         poses[:, :3, 3] += (poses[:, :3, :3] @ own[:, :3, None])[..., 0]
         poses[:, :3, :3] = poses[:, :3, :3] @ _cayley(own[:, 3:6])
-        intrinsics, lens, o = state.intrinsics.copy(), state.lens, state.o
-        count = len(self.intrinsics)
-        intrinsics[list(self.intrinsics)] += shared[:count]
+        lens, o = state.lens, state.o
+        count = len(self.choice.names)
+        intrinsics = state.intrinsics + self.choice.basis @ shared[:count]
         if self.lens:
             lens = lens.copy()
             lens[list(self.lens)] += shared[count : self.camera_unknowns]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -30,7 +30,12 @@ from handeye_tri.calibrate_cameras.homography import (
     Homographies,
     fit_homographies,
 )
+from handeye_tri.calibrate_cameras.intrinsic_choice import (
+    IntrinsicChoice,
+    split_fixed,
+)
 from handeye_tri.calibrate_cameras.least_squares import NormalEquations
+from handeye_tri.calibrate_cameras.lens_verdict import judge_lens
 from handeye_tri.calibrate_cameras.options import (
     lens_choice,
     o_choice,
@@ -43,7 +48,6 @@ from handeye_tri.calibrate_cameras.refine import (
 )
 from handeye_tri.calibrate_cameras.special_motion import diagonals_meet
 from handeye_tri.camera import (
-    INTRINSIC_NAMES,
     LENS_COEFFICIENTS,
     Intrinsics,
     Lens,
@@ -74,6 +78,8 @@ def calibrate_camera(
     image_size: tuple[int, int],
     axis: Axis | Sequence[Axis] = "normal",
     skew: bool = True,
+    fixed: Mapping[str, float] | None = None,
+    aspect: float | None = None,
     distortion: LensModel | Sequence[str] | None = None,
     refine: bool = True,
     method: ClosedFormMethod = "whitened",
@@ -92,11 +98,17 @@ def calibrate_camera(
         before: Pixels of A, B, C before each half-turn, shape (n, 3, 2). Half-turns
             with a NaN, before or after, are left out.
         after: After it, shape (n, 3, 2).
-        triangle: The rig; only its side ratios matter for K.
+        triangle: The rig. Only the ratios of its sides matter for K and lens; their
+            size is that of the poses and of ``o``.
         image_size: (width, height), pixels.
         axis: "normal" (Sec. III-A) or an edge "AB", "BC", "CA" (Sec. III-B); one for
             all half-turns or one each.
         skew: Whether the skew factor is estimated; otherwise it is zero.
+        fixed: What is known of the camera, by name, and not estimated: intrinsics in
+            pixels, as {"cx": 511.5, "cy": 383.5}, or lens coefficients.
+        aspect: fy / fx, where that is known. fy then follows from fx and has no row
+            of its own in ``covariance``. With zero skew, a known principal point and
+            aspect ratio, one half-turn is enough.
         distortion: Lens coefficients to estimate: all of a model, or their names.
         refine: False stops at the closed form.
         method: Closed form by the paper's rows, or by whitened homographies, which
@@ -128,6 +140,8 @@ def calibrate_camera(
           two markers on it moved;
         - "turn_sigmas": (n, 6), the deviation of each half-turn over its prior's root,
           where there is a turn_covariance;
+        - "lens_verdict": a :class:`LensVerdict` for each lens coefficient estimated:
+          its effect in pixels, that of its sigma, and whether it is determined;
         - "used": indices of the half-turns used; "plane_spread_deg"; "start";
           "iterations".
 
@@ -139,10 +153,14 @@ def calibrate_camera(
     lens_model, lens = lens_choice(distortion)
     if method not in ("whitened", "paper"):
         raise InputError(f'method must be "whitened" or "paper", got {method!r}')
-    if not refine and (lens or turn_covariance is not None):
+    inner, coefficients = split_fixed(fixed, lens_model, lens)
+    choice = IntrinsicChoice.of(skew, inner, aspect)
+    partly = fixed is not None or aspect is not None
+    if not refine and (lens or turn_covariance is not None or partly):
         raise InputError(
-            "distortion and turn_covariance need refine=True: the closed form knows "
-            "neither a lens nor inexact half-turns"
+            "distortion, turn_covariance, fixed and aspect need refine=True: the "
+            "closed form knows neither a lens nor inexact half-turns, and of known "
+            "intrinsics only zero skew"
         )
     o_mode, known_o = o_choice(o)
     data, used = read_half_turns(
@@ -152,28 +170,32 @@ def calibrate_camera(
     noise_known = sigma_px is not None or covariance is not None
     turn = turn_covariances(turn_covariance, n, used, noise_known)
     model = HalfTurnModel(
-        data, skew=skew, lens=lens, o_mode=o_mode, turn_covariance=turn
+        data, choice=choice, lens=lens, o_mode=o_mode, turn_covariance=turn
     )
     check_count(
         len(data),
-        skew,
+        len(choice.names),
         model.shared_unknowns,
         4 if model.free_o else 6,
     )
     check_axis_ends(triangle, data.axes)
     homographies = fit_homographies(data, o_mode, known_o)
     check_turns(data, homographies)
-    check_planes(homographies, noise_known)
+    if len(choice.names) > 2:
+        # One plane gives two constraints, and that is enough for two intrinsics.
+        check_planes(homographies, noise_known)
 
     first: ClosedForm | None = None
     try:
-        first = closed_form(data, homographies, skew, method)
+        first = closed_form(
+            data, homographies, choice.conic_basis(homographies.image), method
+        )
     except DegenerateMotionError:
         if not refine or method == "paper":
             raise
     zero = State(
         np.zeros(5),
-        np.zeros(len(LENS_COEFFICIENTS[lens_model])),
+        coefficients,
         np.zeros((len(data), 4, 4)),
         homographies.o,
         np.zeros((len(data), 0 if turn is None else 6)),
@@ -188,8 +210,19 @@ def calibrate_camera(
         data.image_size,
         Lens(lens_model, outcome.state.lens),
     )
-    names = [INTRINSIC_NAMES[i] for i in model.intrinsics]
+    names = [*choice.names]
     names += [LENS_COEFFICIENTS[lens_model][i] for i in lens]
+    details = _details(model, outcome, n, used)
+    if lens:
+        both = np.stack([outcome.state.poses, model.after_poses(outcome.state)], 1)
+        seen = triangle.points @ np.swapaxes(both[..., :3, :3], -1, -2)
+        inner_count = len(choice.names)
+        details["lens_verdict"] = judge_lens(
+            camera,
+            outcome.covariance[inner_count:, inner_count:],
+            names[inner_count:],
+            seen + both[..., None, :3, 3],
+        )
     residuals = np.full((1, 2 * n, 3, 2), np.nan)
     missed = data.pixels - model.predict(outcome.state)
     residuals[0, used], residuals[0, n + used] = missed[:, 0], missed[:, 1]
@@ -206,7 +239,7 @@ def calibrate_camera(
         condition=outcome.condition,
         cost_start=outcome.cost_start,
         method=f"{method}, {'refined' if refine else 'closed form'}",
-        details=_details(model, outcome, n, used),
+        details=details,
     )
 
 
@@ -237,10 +270,10 @@ def _stop_at_closed_form(
             "too weak for it; use refine=True, or planes 20 degrees or more apart"
         )
     noise = homographies.chi2 / homographies.dof
-    rows = np.ix_(model.intrinsics, model.intrinsics)
-    covariance = first.covariance[rows]
+    chosen = model.choice.basis
+    covariance = chosen.T @ first.covariance @ chosen
     _, condition = invert_information(NormalEquations.of(blocks).reduced())
-    sigma = np.sqrt(np.diagonal(covariance)[:2] * least_noise(noise, noise_known))
+    sigma = _focal_sigma(model, covariance, least_noise(noise, noise_known))
     check_determined(
         condition, state.intrinsics[:2], sigma, plane_spread_deg(state.poses[:, :3, 2])
     )
@@ -282,7 +315,7 @@ def _refined(
     covariance = covariance[:count, :count]
     noise = end.cost / model.dof
     spread = plane_spread_deg(state.poses[:, :3, 2])
-    sigma = np.sqrt(np.diagonal(covariance)[:2] * least_noise(noise, noise_known))
+    sigma = _focal_sigma(model, covariance, least_noise(noise, noise_known))
     check_determined(condition, state.intrinsics[:2], sigma, spread)
     if not end.converged:
         raise ConvergenceError(
@@ -302,6 +335,16 @@ def _refined(
     )
 
 
+def _focal_sigma(model: HalfTurnModel, covariance: Floats, noise: float) -> Floats:
+    """Standard deviations of fx and fy, 0 where known, shape (2,), pixels."""
+    by_free = model.choice.basis[:2]
+    of_free = covariance[: by_free.shape[1], : by_free.shape[1]]
+    if not np.isfinite(of_free).all():
+        return np.full(2, np.inf)
+    variance = np.einsum("ik,kl,il->i", by_free, of_free, by_free)
+    return np.asarray(np.sqrt(noise * variance))
+
+
 def _generic_camera(image_size: tuple[int, int]) -> Floats:
     width, height = image_size
     focal = _GENERIC_FOCAL * max(width, height)
@@ -317,9 +360,8 @@ def _generic_camera(image_size: tuple[int, int]) -> Floats:
 def _pinhole_state(
     model: HalfTurnModel, zero: State, k: Floats, poses: Floats
 ) -> State:
-    skew = k[0, 1] if 2 in model.intrinsics else 0.0
-    intrinsics = np.array([k[0, 0], k[1, 1], skew, k[0, 2], k[1, 2]])
-    return replace(zero, intrinsics=intrinsics, poses=poses)
+    vector = np.array([k[0, 0], k[1, 1], k[0, 1], k[0, 2], k[1, 2]])
+    return replace(zero, intrinsics=model.choice.impose(vector), poses=poses)
 
 
 def _details(

@@ -218,27 +218,26 @@ def constraint_rows(
     return np.asarray(hat(lengths / np.linalg.norm(lengths)) @ v)
 
 
-def solve_conic(rows: Floats, skew: bool) -> tuple[Floats, Floats, Floats]:
+def solve_conic(rows: Floats, basis: Floats) -> tuple[Floats, Floats, Floats]:
     """The b of unit length that makes rows @ b least (Sec. III-C).
 
     Args:
         rows: Shape (r, 6).
-        skew: False demands zero skew, that is w12 = 0.
+        basis: Orthonormal columns that b is a sum of, shape (6, k): the unit matrix,
+            or less where something of K is known, as w12 = 0 for zero skew.
 
     Returns:
-        b (6,) with w11 >= 0; singular values (6,) or (5,), descending; the
+        b (6,) with w11 >= 0; singular values (k,), descending; the
         pseudo-inverse of the rows without the direction of b, shape (6, r), which
         maps errors of rows @ b to errors of -b.
     """
-    used = np.arange(6) if skew else np.array([0, 2, 3, 4, 5])
-    u, s, vt = np.linalg.svd(rows[:, used], full_matrices=len(rows) < len(used))
-    s = np.append(s, np.zeros(len(used) - len(s)))
-    b = np.zeros(6)
-    b[used] = vt[-1]
-    rank = len(used) - 1
-    inverse = np.zeros((6, len(rows)))
+    size = basis.shape[1]
+    u, s, vt = np.linalg.svd(rows @ basis, full_matrices=len(rows) < size)
+    s = np.append(s, np.zeros(size - len(s)))
+    b = basis @ vt[-1]
+    rank = size - 1
     floor = np.finfo(float).eps * s[0]
-    inverse[used] = (vt[:rank].T / np.maximum(s[:rank], floor)) @ u[:, :rank].T
+    inverse = basis @ (vt[:rank].T / np.maximum(s[:rank], floor)) @ u[:, :rank].T
     return (-b if b[0] < 0 else b), s, inverse
 
 

@@ -9,6 +9,7 @@ import pytest
 from half_turn_scene import IMAGE_SIZE, TRIANGLE, make_scene, project
 
 from handeye_tri.calibrate_cameras.half_turns import read_half_turns
+from handeye_tri.calibrate_cameras.intrinsic_choice import IntrinsicChoice
 from handeye_tri.calibrate_cameras.refine import (
     HalfTurnModel,
     State,
@@ -20,7 +21,15 @@ MIXED = ("normal", "AB", "BC", "CA")
 TURN_COVARIANCE = np.diag([3e-5**2] * 3 + [1e-4**2] * 3)
 
 
-def setup(o_mode="shared", lens=(), turn=True, skew=True, coefficients=5):
+def setup(
+    o_mode="shared",
+    lens=(),
+    turn=True,
+    skew=True,
+    coefficients=5,
+    fixed=None,
+    aspect=None,
+):
     rng = np.random.default_rng(0)
     scene = make_scene(rng, 4, MIXED)
     covariance = np.empty((4, 2, 3, 2, 2))
@@ -30,7 +39,7 @@ def setup(o_mode="shared", lens=(), turn=True, skew=True, coefficients=5):
     )
     model = HalfTurnModel(
         data,
-        skew=skew,
+        choice=IntrinsicChoice.of(skew, fixed, aspect),
         lens=lens,
         o_mode=o_mode,
         turn_covariance=np.tile(TURN_COVARIANCE, (4, 1, 1)) if turn else None,
@@ -51,6 +60,7 @@ def setup(o_mode="shared", lens=(), turn=True, skew=True, coefficients=5):
         {"turn": False},
         {"o_mode": "known", "skew": False},
         {"o_mode": "free", "lens": (0, 1, 2, 3)},
+        {"aspect": 0.997, "fixed": {"cx": 519.3}, "lens": (1,)},
         {"o_mode": "shared", "lens": tuple(range(8)), "coefficients": 8},
         {"o_mode": "shared", "lens": (0, 4), "turn": False, "skew": False},
     ],
