@@ -233,6 +233,59 @@ def _evaluate(run: Run) -> tuple[list[str], str]:
     )
 
 
+def _report(run: Run) -> tuple[list[str], str]:
+    from handeye_tri import replay
+    from handeye_tri.evaluate import evaluate_track
+    from handeye_tri.report import Origin, render_report
+
+    session, hand_eye, evaluation = run.session(), run.hand_eye(), run.evaluation()
+    track = evaluate_track(hand_eye, session)
+    truth = run.truth()
+    joints = np.array([station.joints for station in session.stations])
+    recording = run.folder.file("replay.rrd")
+    replay.write_recording(
+        recording,
+        name=run.cell.name,
+        mechanism=run.mechanism,
+        world_from_body=run.arm.body_poses(joints),
+        base_from_world=run.arm.base_from_world,
+        session=session,
+        photograph=run.image,
+        calibration=hand_eye,
+        track=track,
+        truth=truth[0] if truth else None,
+        verdict=replay.verdict_markdown(evaluation),
+    )
+    header = run.folder.header
+    page = render_report(
+        evaluation,
+        session,
+        run.cameras(),
+        hand_eye,
+        track,
+        origin=Origin(
+            cell=run.cell.name,
+            seed=run.seed,
+            command=f"handeye-tri run {header['cell_file']} -o {run.folder.path} "
+            f"--seed {run.seed} --half-turns {header['half_turns']}",
+            software=header["software"],
+            files={
+                name: digest
+                for stage in header["stages"]
+                for name, digest in run.folder.outputs(stage).items()
+                if stage != "report"
+            },
+            certificate=run.plan().certificate,
+        ),
+        photograph=run.image,
+    )
+    storage.write_bytes(run.folder.file("report.html"), page.encode())
+    return ["report.html", "replay.rrd"], (
+        f"{len(page) / 1e3:.0f} kB page; recording of {len(joints)} stations, "
+        f"{recording.stat().st_size / 1e6:.1f} MB"
+    )
+
+
 STAGES = {
     stage.name: stage
     for stage in (
@@ -266,6 +319,13 @@ STAGES = {
             ("rig", "arm", "plan", "track_limit_mm"),
             ("plan", "simulate", "detect", "cameras", "hand_eye"),
             _evaluate,
+        ),
+        Stage(
+            "report",
+            "report",
+            ("name", "arm", "rig", "cameras", "surroundings"),
+            ("plan", "simulate", "detect", "cameras", "hand_eye", "evaluate"),
+            _report,
         ),
     )
 }
