@@ -40,7 +40,6 @@ Floats = NDArray[np.float64]
 Photograph = Callable[[str, int], NDArray[np.uint8]]
 Colour = tuple[int, int, int]
 
-APPLICATION = "handeye_tri"
 TIMELINE = "station"
 _NUMBERS = "numbers/track"
 # One colour each, in every view: what was estimated, what was held out, the truth.
@@ -51,10 +50,8 @@ WHITE: Colour = (255, 255, 255)
 _JPEG_QUALITY = 90
 # Our pixel (0, 0) is the first pixel's centre, rerun's is its outer corner.
 _CORNER = 0.5
-# The image of a camera is drawn this far before it, metres; the truth's outline
-# farther, where the image does not hide it.
-_IMAGE_DISTANCE, _TRUTH_DISTANCE = 0.22, 0.27
-_CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 33)) for f in (np.cos, np.sin)], axis=1)
+# How far before a camera its image is drawn, metres, and the truth's outline.
+_IMAGE_DISTANCE, _TRUTH_DISTANCE = 0.25, 0.29
 
 
 def write_recording(
@@ -108,7 +105,7 @@ def write_recording(
         folder = stack.enter_context(TemporaryDirectory(prefix="handeye-tri-"))
         file = Path(folder) / "replay.rrd"
         recording = rr.RecordingStream(
-            APPLICATION,
+            "handeye_tri",
             recording_id=name,
             send_properties=False,
             # Chunks end where the writer ends, not when a clock says so.
@@ -286,11 +283,14 @@ def _log_view(
     predicted = story.predicted[i, j] + _CORNER
     turn = story.turns[i][j]
     found, known = (np.isfinite(p).all(axis=1) for p in (seen, predicted))
+    plus = crosses(predicted[known])
     # Negative radii are widths on the screen, however large the image is shown.
     for name, strips, paint, width, order in (
         ("half_turn", [line + _CORNER for line in turn.lines], WHITE, -0.5, 30),
         ("seen", rings(seen[found]), colour, -1.2, 20),
-        ("predicted", crosses(predicted[known]), WHITE, -0.8, 21),
+        # White on dark, and with a dark edge on white.
+        ("predicted/edge", plus, (0, 0, 0), -1.6, 21),
+        ("predicted", plus, WHITE, -0.7, 22),
     ):
         recording.log(
             f"{path}/{name}",
@@ -304,7 +304,7 @@ def _log_view(
             vectors=story.magnification_px * (seen - predicted)[both],
             colors=[colour],
             radii=[-1.2],
-            draw_order=22,
+            draw_order=23,
         ),
     )
     visible = np.isfinite(turn.centre).all()

@@ -81,11 +81,12 @@ def eye_on_cell(
 
 def eye_on_track(calibration: HandEyeCalibration, story: Story) -> Eye:
     """The held-out track as the first camera sees it, in the base."""
-    points = story.reported[story.held_out].reshape(-1, 3)
-    target = points.mean(axis=0)
-    reach = float(np.linalg.norm(points - target, axis=1).max())
+    target = story.reported[story.held_out].mean(axis=(0, 1))
+    lengths = np.linalg.norm(story.reported - target, axis=-1)
+    # Held-out stations fill the view; nearly all of the others are in it.
+    reach = max(float(lengths[story.held_out].max()), 0.8 * float(lengths.max()))
     towards = calibration.base_from_camera[0].translation - target
-    return Eye(target + 2.0 * reach * towards / np.linalg.norm(towards), target)
+    return Eye(target + 1.7 * reach * towards / np.linalg.norm(towards), target)
 
 
 def _level(direction: Floats) -> Floats:

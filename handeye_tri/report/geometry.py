@@ -172,7 +172,6 @@ def frames(session: Session, calibration: HandEyeCalibration) -> str:
                 textcoords="offset points",
                 ha="right" if away[0] < -4 else "left" if away[0] > 4 else "center",
                 va="top" if away[1] < -4 else "bottom" if away[1] > 4 else "center",
-                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
             )
         ax.plot(*tips.reshape(-1, 2).T, alpha=0)
         ax.set_aspect("equal")
