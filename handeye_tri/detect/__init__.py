@@ -6,18 +6,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.detect import search
+from handeye_tri.detect.ellipse import Indices
 from handeye_tri.detect.identity import assign
 from handeye_tri.detect.markers import Detection, MarkerSpec, Reason, chroma
-from handeye_tri.detect.outline import Indices, Outlines, measure
+from handeye_tri.detect.outline import Outlines, measure
 from handeye_tri.errors import InputError
 from handeye_tri.records import Floats
 
 __all__ = ["Detection", "MarkerSpec", "detect_markers"]
 
+Image = NDArray[np.uint8]
+
 _MIN_SIDE = 32
 
 
-def detect_markers(image: NDArray[np.uint8], markers: MarkerSpec) -> Detection:
+def detect_markers(image: Image, markers: MarkerSpec) -> Detection:
     """Find the balls A, B, C in one image.
 
     The pixel of a marker is the centre of its outline's ellipse, which is not the
@@ -34,29 +37,49 @@ def detect_markers(image: NDArray[np.uint8], markers: MarkerSpec) -> Detection:
     """
     _check(image, markers)
     if markers.identity == "colour":
-        spots = search.coloured_spots(image, markers)
         hues = chroma(markers.colours)
         # The part of the marker's colour, blind to every grey: 255 is all of it.
         weights = hues / (hues**2).sum(axis=1, keepdims=True)
-        weights = weights[[spot.markers[0] for spot in spots]]
-    else:
-        if image.ndim == 3:
-            image = search.grey(image)
-        spots = search.flat_spots(image)
-        weights = None
-    if not spots:
-        return _detection(None, (), [None] * 3, unclear=False)
+        return _measured(image, search.coloured_spots(image, markers), markers, weights)
+    if image.ndim == 3:
+        image = search.grey(image)
+    for stride in search.STRIDES:
+        spots = search.flat_spots(image, stride)
+        detection = _measured(image, spots, markers, None)
+        if detection.complete:
+            break
+    return detection
 
-    def sampler(points: Floats) -> Floats:
+
+def _measured(
+    image: Image,
+    spots: list[search.Candidate],
+    markers: MarkerSpec,
+    weights: Floats | None,
+) -> Detection:
+    """Measure spots and name them.
+
+    Args:
+        image: Grey, or RGB with weights.
+        spots: What to measure.
+        markers: What to name them as.
+        weights: What to add up of red, green and blue for each marker, (3, 3).
+    """
+    if not spots:
+        return _detection([None] * 3, ["no_candidate"] * 3, None)
+    if weights is not None:
+        weights = weights[[spot.markers[0] for spot in spots]]
+
+    def sampler(own: Indices, points: Floats) -> Floats:
         values = search.sample(image, points)
         if weights is None:
             return values
-        return np.asarray(np.einsum("mrsc,mc->mrs", values, weights))
+        return np.asarray((values @ weights[own, None, :, None])[..., 0])
 
     def reader(spot: Indices, row: Indices, column: Indices) -> Floats:
-        values = image[row, column].astype(float)
+        values = image[row, column]
         if weights is None:
-            return values
+            return values.astype(float)
         return np.asarray((values * weights[spot]).sum(axis=1))
 
     outlines = measure(
@@ -67,14 +90,25 @@ def detect_markers(image: NDArray[np.uint8], markers: MarkerSpec) -> Detection:
         np.array([spot.radius for spot in spots]),
     )
     good = [k for k, reason in enumerate(outlines.reasons) if reason is None]
-    chosen, unclear = assign(
-        [spots[k].markers for k in good], outlines.radii[good], markers.radii
+    excess = np.zeros((len(good), 3))
+    if weights is None:
+        # Of a grey image only.
+        excess = outlines.levels[good, None] - 255.0 * markers.colours.mean(axis=1)
+    named, unclear = assign(
+        [spots[k].markers for k in good], outlines.radii[good], markers.radii, excess
     )
-    named = [None if k is None else good[k] for k in chosen]
-    return _detection(outlines, tuple(s.markers for s in spots), named, unclear=unclear)
+    why: list[Reason] = []
+    for marker in range(3):
+        rejected = [
+            reason
+            for spot, reason in zip(spots, outlines.reasons, strict=True)
+            if reason is not None and spot.markers == (marker,)
+        ]
+        why.append("ambiguous" if unclear else (*rejected, "no_candidate")[0])
+    return _detection([None if k is None else good[k] for k in named], why, outlines)
 
 
-def _check(image: NDArray[np.uint8], markers: MarkerSpec) -> None:
+def _check(image: Image, markers: MarkerSpec) -> None:
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
         kind = getattr(image, "dtype", type(image).__name__)
         raise InputError(f"image must be an array of uint8, got {kind}")
@@ -94,33 +128,17 @@ def _check(image: NDArray[np.uint8], markers: MarkerSpec) -> None:
 
 
 def _detection(
-    outlines: Outlines | None,
-    allowed: tuple[tuple[int, ...], ...],
-    named: list[int | None],
-    *,
-    unclear: bool,
+    named: list[int | None], why: list[Reason], outlines: Outlines | None
 ) -> Detection:
+    """Put the named outlines in the markers' order, and say why others lack."""
     pixels = np.full((3, 2), np.nan)
     covariance = np.full((3, 2, 2), np.nan)
     radii = np.full(3, np.nan)
-    reasons: list[Reason | None] = []
+    reasons: list[Reason | None] = list(why)
     for marker, spot in enumerate(named):
         if spot is not None and outlines is not None:
             pixels[marker] = outlines.centres[spot]
             covariance[marker] = outlines.covariance[spot]
             radii[marker] = outlines.radii[spot]
-            reasons.append(None)
-        elif unclear:
-            reasons.append("ambiguous")
-        else:
-            own = (
-                [
-                    reason
-                    for may, reason in zip(allowed, outlines.reasons, strict=True)
-                    if reason is not None and marker in may
-                ]
-                if outlines is not None
-                else []
-            )
-            reasons.append(own[0] if own else "no_candidate")
+            reasons[marker] = None
     return Detection(pixels, covariance, radii, tuple(reasons))

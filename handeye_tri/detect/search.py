@@ -16,13 +16,15 @@ Image = NDArray[np.uint8]
 
 # A look at every fourth pixel of every fourth row first; at more where it finds
 # nothing, so that small markers cost time and not the detection.
-_STRIDES = (4, 2, 1)
+STRIDES = (4, 2, 1)
 # A pixel has a marker's colour from this part of the full chroma on.
 _MIN_PART = 0.35
 _MIN_SAMPLES = 6
 # Grey markers are flat spots: a step of more levels than this is an edge.
 _EDGE_LEVELS = 14.0
-_SHRINK = 2
+# A larger part of the image's side is no marker.
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+_MAX_PART = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +56,7 @@ def coloured_spots(image: Image, spec: MarkerSpec) -> list[Candidate]:
     transform = np.column_stack([hues / strength[:, None], np.full(3, -threshold)])
     wanted = [0, 1, 2]
     found: list[Candidate] = []
-    for stride in _STRIDES:
+    for stride in STRIDES:
         small = image
         if stride > 1:
             size = (-(-image.shape[1] // stride), -(-image.shape[0] // stride))
@@ -95,43 +97,42 @@ def _spots_of(scores: Sequence[Image], marker: int, stride: int) -> list[Candida
     ]
 
 
-def flat_spots(image: Image) -> list[Candidate]:
+def flat_spots(image: Image, shrink: int) -> list[Candidate]:
     """Round spots of one level, of any brightness, enclosed by an edge.
 
     Args:
         image: Grey, shape (h, w).
+        shrink: Looks at the image smaller by this power of two: spots of radius 2.5
+            times this are seen.
     """
-    size = (image.shape[1] // _SHRINK, image.shape[0] // _SHRINK)
-    small = cv2.resize(
-        image[: size[1] * _SHRINK, : size[0] * _SHRINK],
-        size,
-        interpolation=cv2.INTER_AREA,
-    )
-    steps = cv2.morphologyEx(small, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
+    small = image
+    for _ in range(shrink.bit_length() - 1):
+        height, width = (side // 2 for side in small.shape)
+        small = cv2.resize(
+            small[: 2 * height, : 2 * width],
+            (width, height),
+            interpolation=cv2.INTER_AREA,
+        )
+    steps = cv2.morphologyEx(small, cv2.MORPH_GRADIENT, _CROSS)
     threshold = max(_EDGE_LEVELS, 2.0 * float(np.median(steps[::4, ::4])))
-    mask = (steps < threshold).view(np.uint8)
-    _, _, stats, centroids = cv2.connectedComponentsWithStats(mask, connectivity=4)
-    area = stats[:, cv2.CC_STAT_AREA]
-    width = stats[:, cv2.CC_STAT_WIDTH]
-    height = stats[:, cv2.CC_STAT_HEIGHT]
-    fill = area / (width * height)
+    flat = (steps < threshold).view(np.uint8)
+    _, _, stats, centroids = cv2.connectedComponentsWithStats(flat, connectivity=4)
+    _, _, width, height, area = stats[1:].T
     longest = np.maximum(width, height)
-    good = (
-        (area >= _MIN_SAMPLES)
-        & (longest <= 1.6 * np.minimum(width, height) + 1)
-        & (fill > 0.6)
-        & (longest < 0.2 * min(size))
-    )
-    good[0] = False
-    half = 0.5 * (_SHRINK - 1)
+    round_ = (longest <= 1.5 * np.minimum(width, height) + 1) & (longest >= 2)
+    round_ &= (area > 0.6 * width * height) & (longest < _MAX_PART * min(flat.shape))
+    middle = 0.5 * (shrink - 1)
     return [
         Candidate(
             (0, 1, 2),
-            tuple(_SHRINK * centroids[k] + half),
+            (
+                shrink * float(centroids[k, 0]) + middle,
+                shrink * float(centroids[k, 1]) + middle,
+            ),
             # The edge's width is missing all around.
-            _SHRINK * float(np.sqrt(area[k] / np.pi) + 1.2),
+            shrink * (float(np.sqrt(area[k - 1] / np.pi)) + 1.3),
         )
-        for k in np.flatnonzero(good)
+        for k in 1 + np.flatnonzero(round_)
     ]
 
 

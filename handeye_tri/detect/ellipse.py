@@ -1,0 +1,273 @@
+"""Ellipses fitted to the pixels along their edges, by Gauss-Newton.
+
+Across an edge, the part of a pixel that is covered follows the normal distribution
+of the distance to the outline; a pixel's own area counts as a blur of variance
+1/12 px^2 in every direction.
+
+An ellipse (1 + e) x^2 + 2 f x y + (1 - e) y^2 = R^2 about its centre is a row of six
+numbers: centre (2), R, e, f, and the blur of its edge, sigma, in px.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from handeye_tri.records import Floats
+
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+
+# Directions into which the outline is divided.
+RAYS = 64
+ANGLES = 2.0 * np.pi * np.arange(RAYS) / RAYS
+_DOUBLE = np.stack([np.cos(2 * ANGLES), np.sin(2 * ANGLES)])
+_BESIDE = (np.arange(RAYS)[:, None] + np.arange(-1, 2)) % RAYS
+# 1.4826 times the median of absolute deviations is a standard deviation.
+MAD = 1.4826
+BLUR_RANGE = (0.28, 2.5)
+# The edge ends at so many sigmas of its blur.
+EDGE_SIGMAS = 3.0
+# Linear steps, with what does not fit left out, before the model is taken anew.
+_STEPS = (1, 2)
+_NEARLY_NOTHING = 1e-6 * np.eye(6)
+_TRIM_SIGMAS = 3.5
+# Edges nearer to the fit than this are never trimmed, px.
+_TRIM_FLOOR = 0.15
+# Behind the edge, in its last part, covers must vanish on the mean to within this.
+_BEHIND_SIGMAS = 1.5
+_MAX_SURPLUS = 0.1
+# Harmonics of the edge's residual that tell its noise: the fit absorbs 0, 1 and 2.
+_NOISE_HARMONICS = slice(3, 11)
+# Not in the scatter, px: an outline seen through a lens is not quite an ellipse.
+_MODEL_ERROR = 0.005
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edge:
+    """The n pixels along the edges of m ellipses, sorted by ellipse.
+
+    Attributes:
+        starts: First pixel of each ellipse, and n, shape (m + 1,).
+        spot: Ellipse of each pixel, shape (n,).
+        columns: Shape (n,).
+        rows: Shape (n,).
+        ray: Ellipse and direction of each pixel, ellipse * RAYS + direction, (n,).
+        background: Level behind the edge, shape (m * RAYS,).
+        weight: How much each direction counts, 0-1, shape (m * RAYS,).
+    """
+
+    starts: Indices
+    spot: Indices
+    columns: Indices
+    rows: Indices
+    ray: Indices
+    background: Floats
+    weight: Floats
+
+    def covers(self, values: Floats, levels: Floats) -> Floats:
+        """Part of each pixel that is covered, shape (n,).
+
+        Args:
+            values: Levels of the pixels, shape (n,).
+            levels: Level inside each ellipse, shape (m,).
+        """
+        contrast = np.repeat(levels, RAYS) - self.background
+        contrast[self.weight == 0] = np.inf
+        return np.asarray((values - self.background[self.ray]) / contrast[self.ray])
+
+    def sums(self, values: Floats) -> Floats:
+        """Sums of values (n,) by direction, shape (m, RAYS)."""
+        total = np.bincount(self.ray, values, len(self.weight))
+        return np.asarray(total.reshape(-1, RAYS))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EllipseFit:
+    """Ellipses that fit m edges.
+
+    Attributes:
+        ellipses: Shape (m, 6).
+        covariance: Of the centres, shape (m, 2, 2), px^2.
+        misfit: Root mean square distance of the edge from the ellipse beyond what the
+            noise behind the edge explains, shape (m,), px.
+        usable: Part of the directions that the fit uses, shape (m,).
+        hidden: Part of the directions where the edge lies inside the ellipse by more
+            than its scatter: something is before the ball, shape (m,).
+        astray: Part of the directions where it lies off to either side, shape (m,).
+    """
+
+    ellipses: Floats
+    covariance: Floats
+    misfit: Floats
+    usable: Floats
+    hidden: Floats
+    astray: Floats
+
+
+def medians(values: Floats, counted: Flags) -> Floats:
+    """Lower medians of the counted values, shape (m,), of (m, k); 0 where none is."""
+    ordered = np.sort(np.where(counted, values, np.inf), axis=1)
+    count = counted.sum(axis=1)
+    middle = ordered[np.arange(len(values)), np.maximum(count - 1, 0) // 2]
+    return np.where(count > 0, middle, 0.0)
+
+
+def radii_by_direction(ellipses: Floats) -> Floats:
+    """Distance from centre to outline, shape (m, RAYS), px, of ellipses (m, 6)."""
+    return np.asarray(ellipses[:, 2:3] / np.sqrt(1 + ellipses[:, 3:5] @ _DOUBLE))
+
+
+def pixels_around(
+    ellipses: Floats, background: Floats, weight: Floats, image_size: tuple[int, int]
+) -> Edge:
+    """Collect the pixels along the edges.
+
+    Args:
+        ellipses: Shape (m, 6).
+        background: Level behind the edge by direction, shape (m, RAYS).
+        weight: How much it counts there, 0-1, shape (m, RAYS).
+        image_size: (width, height), pixels.
+    """
+    x0, y0, size, e, f, blur = ellipses.T[..., None, None]
+    width = EDGE_SIGMAS * blur
+    reach = size / np.sqrt(1 - np.hypot(e, f)) + width
+    half = int(reach.max()) + 2
+    span = np.arange(-half, half + 1)
+    left, top = np.rint(x0).astype(np.intp), np.rint(y0).astype(np.intp)
+    x = (left - x0) + span
+    y = (top - y0) + span[:, None]
+    q = np.sqrt((1 + e) * x * x + y * ((1 - e) * y + 2 * f * x))
+    spot, row, column = np.nonzero(np.abs(q - size) < width)
+    columns = column + (left.ravel() - half)[spot]
+    rows = row + (top.ravel() - half)[spot]
+    inside = (columns >= 0) & (columns < image_size[0])
+    inside &= (rows >= 0) & (rows < image_size[1])
+    if not inside.all():
+        spot, columns, rows = spot[inside], columns[inside], rows[inside]
+    angle = np.arctan2(rows - ellipses[spot, 1], columns - ellipses[spot, 0])
+    direction = np.rint(angle * (RAYS / (2 * np.pi))).astype(np.intp) % RAYS
+    return Edge(
+        np.searchsorted(spot, np.arange(len(ellipses) + 1)),
+        spot,
+        columns,
+        rows,
+        spot * RAYS + direction,
+        background.ravel(),
+        weight.ravel(),
+    )
+
+
+def fit_ellipses(
+    edge: Edge, covers: Floats, ellipses: Floats, trusted: Flags
+) -> EllipseFit:
+    """Least squares on the covers; directions that do not fit are left out.
+
+    The covariance takes the scatter of the edge about the fit, as it is along this
+    outline, at wavelengths near those that move the centre: it holds for noise of
+    the sensor, blurred or not, and for the staircase of a rendered edge.
+
+    Args:
+        edge: The pixels.
+        covers: What was measured there, shape (n,).
+        ellipses: Start, shape (m, 6), to a fraction of a pixel.
+        trusted: Directions to begin with, shape (m, RAYS).
+    """
+    ellipses = ellipses.copy()
+    m = len(ellipses)
+    own = [slice(edge.starts[k], edge.starts[k + 1]) for k in range(m)]
+    offered = (edge.weight > 0).reshape(m, RAYS)
+    shown = offered & trusted
+    step, left = np.empty((m, 6)), np.empty(len(covers))
+    for steps in _STEPS:
+        model, jacobian, slope, behind = _covers(edge, ellipses)
+        residual = covers - model
+        information = edge.sums(slope * slope)
+        many = edge.sums(behind)
+        # Nothing lies behind the edge of an ellipse that has run away.
+        noise = np.array(
+            [
+                MAD * np.median(np.abs(np.append(residual[k][behind[k] > 0], 0.0)))
+                for k in own
+            ]
+        )
+        surplus = np.maximum(
+            _MAX_SURPLUS * many, _TRIM_SIGMAS * noise[:, None] * np.sqrt(many)
+        )
+        # The linear model is good enough to find what does not fit, and without it
+        # to step again.
+        for _ in range(steps):
+            counted = (edge.weight * shown.ravel())[edge.ray]
+            weighted = counted * jacobian
+            for k, part in enumerate(own):
+                normal = weighted[:, part] @ jacobian[:, part].T
+                # Keeps an outline without usable pixels from being singular.
+                normal += _NEARLY_NOTHING
+                step[k] = np.linalg.solve(normal, weighted[:, part] @ residual[part])
+                left[part] = residual[part] - step[k] @ jacobian[:, part]
+            # How far out of the fit the edge lies in each direction, px.
+            out = edge.sums(slope * left) / np.maximum(information, 1e-9)
+            limit = _TRIM_SIGMAS * MAD * medians(np.abs(out), shown)
+            limit = np.maximum(limit, _TRIM_FLOOR)[:, None]
+            # Something else may begin right behind the edge.
+            bad = np.abs(out) > limit
+            bad |= np.abs(edge.sums(behind * left)) > surplus
+            shown = offered & ~bad[:, _BESIDE].any(axis=2)
+        ellipses += np.clip(step, -1.5, 1.5)
+        ellipses[:, 2] = np.maximum(ellipses[:, 2], 1.0)
+        ellipses[:, 3:5] = np.clip(ellipses[:, 3:5], -0.6, 0.6)
+        ellipses[:, 5] = np.clip(ellipses[:, 5], *BLUR_RANGE)
+    count = np.maximum(shown.sum(axis=1), 1)
+    kept = np.where(shown, out, 0.0)
+    power = np.abs(np.fft.rfft(kept, axis=1)[:, _NOISE_HARMONICS]) ** 2
+    # White noise of variance v in each of k directions has the power k v.
+    variance = power.mean(axis=1) / count
+    variance *= (information * shown).sum(axis=1) / count
+    expected = (noise**2)[:, None] * shown / np.maximum(information, 1e-9)
+    expected = expected.sum(axis=1) / count
+    covariance = np.empty((m, 2, 2))
+    for k, part in enumerate(own):
+        inverse = np.linalg.inv(
+            weighted[:, part] @ jacobian[:, part].T + _NEARLY_NOTHING
+        )
+        pull = inverse[:2] @ weighted[:, part]
+        covariance[k] = variance[k] * (pull @ pull.T) + _MODEL_ERROR**2 * np.eye(2)
+    return EllipseFit(
+        ellipses,
+        covariance,
+        np.sqrt(np.maximum((kept**2).sum(axis=1) / count - expected, 0.0)),
+        shown.mean(axis=1),
+        (offered & (out < -limit)).mean(axis=1),
+        (offered & (np.abs(out) > limit)).mean(axis=1),
+    )
+
+
+def _covers(edge: Edge, ellipses: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Model of the covers.
+
+    Returns:
+        Covers (n,); derivatives by the ellipses' numbers (6, n); derivative by an
+        outward shift of the edge (n,), 1/px; 1 behind the edge, else 0, (n,).
+    """
+    x0, y0, size, e, f, blur = ellipses.T[:, edge.spot]
+    x, y = edge.columns - x0, edge.rows - y0
+    ax = (1 + e) * x + f * y
+    ay = f * x + (1 - e) * y
+    q = np.sqrt(x * ax + y * ay)
+    # First-order distance to the outline: (q - R) / |grad q|; exact for a circle.
+    gradient = np.sqrt(ax * ax + ay * ay) / q
+    z = (q - size) / (gradient * blur)
+    slope = np.exp(-0.5 * z * z) / (np.sqrt(2 * np.pi) * blur)
+    by_q = slope / gradient
+    over = by_q / q
+    jacobian = np.empty((6, len(x)))
+    jacobian[0] = over * ax
+    jacobian[1] = over * ay
+    jacobian[2] = by_q
+    jacobian[3] = -0.5 * over * (x * x - y * y)
+    jacobian[4] = -over * x * y
+    jacobian[5] = slope * z
+    return ndtr(-z), jacobian, slope, (z > _BEHIND_SIGMAS).astype(float)
