@@ -94,6 +94,18 @@ def check_axis_ends(triangle: TriangleRig, axes: Sequence[Axis]) -> None:
                 )
 
 
+def _side_px(data: HalfTurnData) -> Floats:
+    """Mean side of the triangle before each half-turn, shape (n,), pixels."""
+    first = data.pixels[:, 0]
+    sides = np.linalg.norm(first - np.roll(first, -1, axis=1), axis=-1)
+    return np.asarray(sides.mean(axis=1))
+
+
+def is_turn(data: HalfTurnData, homographies: Homographies) -> NDArray[np.bool_]:
+    """Which half-turns fit a plane to within a twentieth of the triangle's side."""
+    return np.asarray(homographies.residual_px <= _MAX_TURN_RESIDUAL * _side_px(data))
+
+
 def check_turns(data: HalfTurnData, homographies: Homographies) -> None:
     """Refuse images that are no half-turn about the stated axis, whatever K is.
 
@@ -103,12 +115,11 @@ def check_turns(data: HalfTurnData, homographies: Homographies) -> None:
     Raises:
         DegenerateMotionError: names the worst half-turn and its residual.
     """
-    first = data.pixels[:, 0]
-    side = np.linalg.norm(first - np.roll(first, -1, axis=1), axis=-1).mean(axis=1)
+    if is_turn(data, homographies).all():
+        return
+    side = _side_px(data)
     worst = int(np.argmax(homographies.residual_px / side))
     residual = float(homographies.residual_px[worst])
-    if residual <= _MAX_TURN_RESIDUAL * side[worst]:
-        return
     raise DegenerateMotionError(
         f"half-turn {data.index[worst]} is no half-turn about {data.axes[worst]!r}: no "
         f"plane fits its two images, RMS residual {residual:.2f} px for a "

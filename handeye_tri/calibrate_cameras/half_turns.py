@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,6 +51,22 @@ class HalfTurnData:
         """Number of half-turns."""
         return len(self.pixels)
 
+    def take(self, rows: Sequence[int] | NDArray[np.intp]) -> HalfTurnData:
+        """Some of the half-turns, in the order of ``rows``."""
+        index = np.asarray(rows, dtype=np.intp)
+        return HalfTurnData(
+            self.pixels[index],
+            self.whitener[index],
+            self.triangle,
+            self.points,
+            tuple(self.axes[i] for i in index),
+            self.rotation[index],
+            self.offset[index],
+            self.about_normal[index],
+            self.image_size,
+            self.index[index],
+        )
+
     def translation(self, o: Floats) -> Floats:
         """Translation of each half-turn, shape (n, 3), metres.
 
@@ -70,6 +86,7 @@ def read_half_turns(
     axis: Axis | Sequence[Axis],
     sigma_px: float | None,
     covariance: ArrayLike | None,
+    dropped: dict[int, str] | None = None,
 ) -> tuple[HalfTurnData, NDArray[np.intp]]:
     """Check what the caller gave and keep the complete half-turns.
 
@@ -81,6 +98,8 @@ def read_half_turns(
         axis: One for all half-turns, or one each.
         sigma_px: Standard deviation of every pixel coordinate, or None.
         covariance: Covariance of every observed point, (n, 2, 3, 2, 2), or None.
+        dropped: Takes half-turns whose pixels are no half-turn, and why, instead of
+            an error; they are left out.
 
     Returns:
         The half-turns in which all six points are finite; their indices.
@@ -102,7 +121,16 @@ def read_half_turns(
             "after it (the others hold NaN); check the detection"
         )
     kept = tuple(axes[i] for i in used)
-    _check_pixels(pixels[used], kept, image_size, used)
+    size = np.asarray(image_size)
+    if size.shape != (2,) or not (size >= 1).all():
+        raise InputError(f"image_size must be (width, height) in pixels, got {size}")
+    for i, error in _faults(pixels[used], kept, size, used):
+        if dropped is None:
+            raise error
+        dropped.setdefault(int(i), str(error))
+    if dropped:
+        used = np.setdiff1d(used, np.array(list(dropped), dtype=np.intp))
+        kept = tuple(axes[i] for i in used)
     motions = {
         name: triangle.half_turn(name, np.zeros(2) if name == "normal" else None)
         for name in set(kept)
@@ -185,41 +213,45 @@ def _whitener(sigma_px: float | None, covariance: ArrayLike | None, n: int) -> F
     return result
 
 
-def _check_pixels(
+def _faults(
     pixels: Floats,
     axes: tuple[Axis, ...],
-    image_size: tuple[int, int],
+    size: NDArray[np.intp],
     used: NDArray[np.intp],
-) -> None:
-    """Refuse pixels that no camera of this size can have seen like that."""
-    size = np.asarray(image_size)
-    if size.shape != (2,) or not (size >= 1).all():
-        raise InputError(f"image_size must be (width, height) in pixels, got {size}")
+) -> Iterator[tuple[int, InputError | DegenerateMotionError]]:
+    """Half-turns that no camera of this size can have seen like that, with errors."""
     outside = np.argwhere(((pixels < -0.5) | (pixels > size - 0.5)).any(axis=-1))
-    if len(outside):
-        i, j, k = outside[0]
+    for i, j, k in outside:
         u, v = pixels[i, j, k]
-        raise InputError(
-            f"marker {VERTICES[k]} {('before', 'after')[j]} half-turn {used[i]} lies "
-            f"at ({u:.1f}, {v:.1f}), outside the {size[0]} x {size[1]} image "
-            f"({len(outside)} such points); check image_size and the order (column, "
-            "row)"
+        yield (
+            used[i],
+            InputError(
+                f"marker {VERTICES[k]} {('before', 'after')[j]} half-turn {used[i]} "
+                f"lies at ({u:.1f}, {v:.1f}), outside the {size[0]} x {size[1]} image "
+                f"({len(outside)} such points); check image_size and the order "
+                "(column, row)"
+            ),
         )
     apart = np.linalg.norm(pixels - np.roll(pixels, -1, axis=2), axis=-1)
     same = np.argwhere(apart < _MIN_DISTANCE)
-    if len(same):
-        i, j, k = same[0]
-        raise DegenerateMotionError(
-            f"markers {VERTICES[k]} and {VERTICES[(k + 1) % 3]} "
-            f"{('before', 'after')[j]} half-turn {used[i]} are {apart[i, j, k]:.3f} px "
-            "apart in the image: one of them was found twice, or the triangle is seen "
-            "edge-on; drop this half-turn"
+    for i, j, k in same:
+        yield (
+            used[i],
+            DegenerateMotionError(
+                f"markers {VERTICES[k]} and {VERTICES[(k + 1) % 3]} "
+                f"{('before', 'after')[j]} half-turn {used[i]} are "
+                f"{apart[i, j, k]:.3f} px apart in the image: one of them was found "
+                "twice, or the triangle is seen edge-on; drop this half-turn"
+            ),
         )
     moved = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=-1)
     for i, axis in enumerate(axes):
         if np.sort(moved[i])[1 if axis == "normal" else 2] < _MIN_DISTANCE:
-            raise DegenerateMotionError(
-                f"half-turn {used[i]} about {axis!r} moved A, B, C by only "
-                f"{', '.join(f'{d:.3f}' for d in moved[i])} px: the image after it "
-                "shows the triangle unturned; check axis and order of the images"
+            yield (
+                used[i],
+                DegenerateMotionError(
+                    f"half-turn {used[i]} about {axis!r} moved A, B, C by only "
+                    f"{', '.join(f'{d:.3f}' for d in moved[i])} px: the image after it "
+                    "shows the triangle unturned; check axis and order of the images"
+                ),
             )

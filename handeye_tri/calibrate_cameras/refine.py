@@ -19,6 +19,7 @@ from handeye_tri.calibrate_cameras.half_turns import HalfTurnData
 from handeye_tri.calibrate_cameras.homography import OMode
 from handeye_tri.calibrate_cameras.intrinsic_choice import IntrinsicChoice
 from handeye_tri.calibrate_cameras.least_squares import Blocks, Minimum, minimise
+from handeye_tri.calibrate_cameras.robust_loss import Loss, soften
 from handeye_tri.camera import distort_jacobians
 from handeye_tri.se3 import hat, so3_exp, so3_left_jacobian
 
@@ -68,6 +69,7 @@ class HalfTurnModel:
         lens: tuple[int, ...],
         o_mode: OMode,
         turn_covariance: Floats | None,
+        loss: Loss | None = None,
     ) -> None:
         """Choose the unknowns.
 
@@ -78,8 +80,10 @@ class HalfTurnModel:
             o_mode: How O is treated; without a normal axis it plays no part.
             turn_covariance: Shape (n, 6, 6), m and rad, positive semi-definite;
                 None for exact half-turns.
+            loss: Of each point's whitened residual; None for its square.
         """
         self.data = data
+        self.loss = loss
         self.choice = choice
         self.lens = lens
         has_o = o_mode != "known" and bool(data.about_normal.any())
@@ -111,6 +115,18 @@ class HalfTurnModel:
         """Observations less unknowns; a prior counts as an observation."""
         feet = 2 * int(self.data.about_normal.sum()) if self.free_o else 0
         return 6 * len(self.data) - self.shared_unknowns - feet
+
+    @property
+    def turn_unknowns(self) -> int:
+        """Unknowns of how far a half-turn misses: 6 or 0."""
+        return 0 if self.turn_root is None else 6
+
+    def with_camera_known(self) -> HalfTurnModel:
+        """The same model with nothing but own unknowns, each half-turn by itself."""
+        result = self.with_lens(())
+        result.choice = IntrinsicChoice((), np.zeros((5, 0)), np.zeros(5), None)
+        result.shared_o = False
+        return result
 
     def with_lens(self, lens: tuple[int, ...]) -> HalfTurnModel:
         """The same model with these lens coefficients estimated."""
@@ -209,7 +225,10 @@ class HalfTurnModel:
             start = size + inner
             columns[..., start : size + count] = upper @ by_lens[..., self.lens]
         columns[..., -1] = xy @ upper.T + (cx, cy) - self.data.pixels
-        rows = (self.data.whitener @ columns).reshape(n, 12, -1)
+        rows = self.data.whitener @ columns
+        if self.loss is not None:
+            soften(rows, self.loss)
+        rows = rows.reshape(n, 12, -1)
         if self.turn_root is not None:
             prior = np.zeros((n, 6, rows.shape[-1]))
             prior[..., size - 6 : size] = np.eye(6)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +24,6 @@ from handeye_tri.calibrate_cameras.degeneracy import (
     least_noise,
     plane_spread_deg,
 )
-from handeye_tri.calibrate_cameras.extrinsics import poses_from_homographies
 from handeye_tri.calibrate_cameras.half_turns import HalfTurnData, read_half_turns
 from handeye_tri.calibrate_cameras.homography import (
     Homographies,
@@ -41,12 +40,19 @@ from handeye_tri.calibrate_cameras.options import (
     o_choice,
     turn_covariances,
 )
+from handeye_tri.calibrate_cameras.outlier_reasons import drop_outliers
 from handeye_tri.calibrate_cameras.refine import (
     HalfTurnModel,
     State,
     refine_from_starts,
 )
+from handeye_tri.calibrate_cameras.robust_loss import LOSSES, Loss
 from handeye_tri.calibrate_cameras.special_motion import diagonals_meet
+from handeye_tri.calibrate_cameras.starts import (
+    blank_state,
+    pinhole_state,
+    refinement_starts,
+)
 from handeye_tri.camera import (
     LENS_COEFFICIENTS,
     Intrinsics,
@@ -64,10 +70,6 @@ from handeye_tri.se3 import SE3
 from handeye_tri.triangle import EDGES, Axis, TriangleRig
 
 Floats = NDArray[np.float64]
-
-# Focal length of the generic second start over the longer side of the image: too
-# long rather than too short, from where the descent is smoother.
-_GENERIC_FOCAL = 2.5
 
 
 def calibrate_camera(
@@ -87,6 +89,8 @@ def calibrate_camera(
     covariance: ArrayLike | None = None,
     o: Literal["shared", "free"] | ArrayLike = "shared",
     turn_covariance: ArrayLike | None = None,
+    loss: Loss | None = None,
+    reject: bool = False,
     name: str = "camera",
 ) -> CameraCalibration:
     """Calibrate one camera from n half-turns of three markers.
@@ -122,6 +126,12 @@ def calibrate_camera(
         turn_covariance: Of the tangent xi (translation m, rotation rad) by which a
             half-turn misses, ``after = before @ half_turn @ exp(xi)`` in the
             triangle's frame, shape (6, 6) or (n, 6, 6). None: half-turns are exact.
+        loss: Of each point in the refinement: its square, or Huber's or Cauchy's loss,
+            for errors with heavy tails. ``chi2`` is then the sum of the losses.
+        reject: Leave out half-turns that disagree with the others: a wrong point,
+            exchanged labels, a repeated image, a turn by another angle. A quarter of
+            them may be bad. A good one is dropped with a chance of about 1e-5 where
+            the noise is normal and as stated.
         name: The camera's name in the covariance labels.
 
     Returns:
@@ -142,6 +152,7 @@ def calibrate_camera(
           where there is a turn_covariance;
         - "lens_verdict": a :class:`LensVerdict` for each lens coefficient estimated:
           its effect in pixels, that of its sigma, and whether it is determined;
+        - "dropped": with ``reject``, why each half-turn was dropped, by index;
         - "used": indices of the half-turns used; "plane_spread_deg"; "start";
           "iterations".
 
@@ -163,22 +174,49 @@ def calibrate_camera(
             "intrinsics only zero skew"
         )
     o_mode, known_o = o_choice(o)
+    dropped: dict[int, str] = {}
     data, used = read_half_turns(
-        before, after, triangle, image_size, axis, sigma_px, covariance
+        before,
+        after,
+        triangle,
+        image_size,
+        axis,
+        sigma_px,
+        covariance,
+        dropped if reject else None,
     )
     n = len(np.asarray(before))
     noise_known = sigma_px is not None or covariance is not None
+    if loss is not None and (loss not in LOSSES or not noise_known or not refine):
+        raise InputError(
+            f"loss must be None or one of {', '.join(LOSSES)}, with refine=True and "
+            f"sigma_px or covariance, which say what is far; got {loss!r}"
+        )
     turn = turn_covariances(turn_covariance, n, used, noise_known)
-    model = HalfTurnModel(
-        data, choice=choice, lens=lens, o_mode=o_mode, turn_covariance=turn
-    )
-    check_count(
-        len(data),
-        len(choice.names),
-        model.shared_unknowns,
-        4 if model.free_o else 6,
-    )
+
+    def build(part: HalfTurnData, rows: NDArray[np.intp]) -> HalfTurnModel:
+        return HalfTurnModel(
+            part,
+            choice=choice,
+            lens=lens,
+            o_mode=o_mode,
+            turn_covariance=None if turn is None else turn[rows],
+            loss=loss,
+        )
+
+    everything = np.arange(len(data))
+    model = build(data, everything)
+    per_half_turn = 4 if model.free_o else 6
+    check_count(len(data), len(choice.names), model.shared_unknowns, per_half_turn)
     check_axis_ends(triangle, data.axes)
+    if reject:
+        kept, why = drop_outliers(
+            data, build, coefficients, o_mode, known_o, noise_known
+        )
+        dropped.update(why)
+        data, used = data.take(kept), used[kept]
+        model = build(data, kept)
+        check_count(len(data), len(choice.names), model.shared_unknowns, per_half_turn)
     homographies = fit_homographies(data, o_mode, known_o)
     check_turns(data, homographies)
     if len(choice.names) > 2:
@@ -193,13 +231,7 @@ def calibrate_camera(
     except DegenerateMotionError:
         if not refine or method == "paper":
             raise
-    zero = State(
-        np.zeros(5),
-        coefficients,
-        np.zeros((len(data), 4, 4)),
-        homographies.o,
-        np.zeros((len(data), 0 if turn is None else 6)),
-    )
+    zero = blank_state(model, coefficients, homographies)
     if first is not None and not refine:
         outcome = _stop_at_closed_form(model, zero, first, homographies, noise_known)
     else:
@@ -213,6 +245,8 @@ def calibrate_camera(
     names = [*choice.names]
     names += [LENS_COEFFICIENTS[lens_model][i] for i in lens]
     details = _details(model, outcome, n, used)
+    if reject:
+        details["dropped"] = dropped
     if lens:
         both = np.stack([outcome.state.poses, model.after_poses(outcome.state)], 1)
         seen = triangle.points @ np.swapaxes(both[..., :3, :3], -1, -2)
@@ -261,7 +295,7 @@ def _stop_at_closed_form(
     homographies: Homographies,
     noise_known: bool,
 ) -> _Outcome:
-    state = _pinhole_state(model, zero, first.k, first.poses)
+    state = pinhole_state(model, zero, first.k, first.poses)
     blocks = model.evaluate(state)
     if blocks is None:
         raise DegenerateMotionError(
@@ -295,12 +329,7 @@ def _refined(
     homographies: Homographies,
     noise_known: bool,
 ) -> _Outcome:
-    generic = _generic_camera(model.data.image_size)
-    poses = poses_from_homographies(generic, homographies, model.data.triangle)
-    starts = {"generic": _pinhole_state(model, zero, generic, poses)}
-    if first is not None:
-        closed = _pinhole_state(model, zero, first.k, first.poses)
-        starts = {"closed form": closed, **starts}
+    starts = refinement_starts(model, zero, first, homographies)
     found = refine_from_starts(model, list(starts.values()))
     if found is None:
         raise DegenerateMotionError(
@@ -323,7 +352,8 @@ def _refined(
             f"{end.cost_start:.4g} to {end.cost:.4g} for {model.dof} degrees of "
             "freedom); estimate fewer lens coefficients or add half-turns"
         )
-    closed_cost = None if first is None else model.evaluate(closed)
+    closed = starts.get("closed form")
+    closed_cost = None if closed is None else model.evaluate(closed)
     return _Outcome(
         state,
         covariance * (1.0 if noise_known else noise),
@@ -343,25 +373,6 @@ def _focal_sigma(model: HalfTurnModel, covariance: Floats, noise: float) -> Floa
         return np.full(2, np.inf)
     variance = np.einsum("ik,kl,il->i", by_free, of_free, by_free)
     return np.asarray(np.sqrt(noise * variance))
-
-
-def _generic_camera(image_size: tuple[int, int]) -> Floats:
-    width, height = image_size
-    focal = _GENERIC_FOCAL * max(width, height)
-    return np.array(
-        [
-            [focal, 0.0, 0.5 * (width - 1)],
-            [0.0, focal, 0.5 * (height - 1)],
-            [0.0, 0.0, 1.0],
-        ]
-    )
-
-
-def _pinhole_state(
-    model: HalfTurnModel, zero: State, k: Floats, poses: Floats
-) -> State:
-    vector = np.array([k[0, 0], k[1, 1], k[0, 1], k[0, 2], k[1, 2]])
-    return replace(zero, intrinsics=model.choice.impose(vector), poses=poses)
 
 
 def _details(
