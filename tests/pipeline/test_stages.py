@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 
+from handeye_tri.replay.recording import read_numbers
 from handeye_tri.storage import read_image, sha256, write_image
 
 
@@ -72,6 +73,31 @@ def test_every_file_is_there_and_recorded(session):
     results = {"plan.json", "truth.json", "observations.npz", "cameras.json"}
     results |= {"hand_eye.json", "evaluation.json", "replay.rrd", "report.html"}
     assert results <= set(found)
+
+
+def test_the_recording_holds_the_numbers_of_the_evaluation(session):
+    numbers, track = read_numbers(session / "replay.rrd"), evaluation(session)["track"]
+    for name in ("mean_mm", "rms_mm", "max_mm", "predicted_rms_mm"):
+        assert numbers[name] == track[name]
+    positions = track["positions"]
+    for name in ("reported_m", "observed_m"):
+        assert numbers[name] == [row[name] for row in positions]
+    assert numbers["stations"] == [row["station"] for row in positions]
+    assert numbers["worst_station"] == track["worst_station"]
+
+
+def test_the_recording_opens_without_a_view_error(session, tmp_path):
+    picture = tmp_path / "replay.png"
+    done = command("replay", session, "--screenshot", picture)
+    assert done.returncode == 0, done.stderr
+    assert "view error" not in done.stderr
+    seen = read_image(picture)
+    assert seen.shape == (1000, 1600, 3)
+    # Markers of all three pure colours are on screen: the images are shown.
+    for channel in range(3):
+        others = [c for c in range(3) if c != channel]
+        pure = (seen[..., channel] > 200) & (seen[..., others].max(axis=2) < 60)
+        assert pure.sum() > 50
 
 
 def test_the_track_is_accurate_and_adds_up(session):
