@@ -316,8 +316,8 @@ def _minimum(
     rounding = float(np.finfo(float).eps * largest * whitest)
     end = minimise(model.evaluate, model.retract, state, rounding)
     assert end is not None
-    check_determined(end, cameras)
     if not end.converged:
+        check_determined(end, cameras)
         raise ConvergenceError(
             f"the joint adjustment did not settle in {end.iterations} iterations (chi2 "
             f"{end.cost_start:.4g} to {end.cost:.4g}); start nearer, or estimate fewer "

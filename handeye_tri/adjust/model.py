@@ -63,6 +63,15 @@ class Linearisation:
         return self.model.equations(self.state)
 
 
+@dataclass(slots=True, eq=False)
+class _Workspace:
+    """Arrays of the normal equations, made at first use, and what state they are of."""
+
+    arrays: tuple[Floats, Floats, Floats] | None = None
+    state: State | None = None
+    equations: ChunkedEquations | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustmentModel:
     """Measurements and the choice of unknowns.
@@ -94,7 +103,7 @@ class AdjustmentModel:
     columns: tuple[slice, ...] = field(init=False)
     rig: slice = field(init=False)
     shared: int = field(init=False)
-    _buffers: list[Floats] = field(init=False, repr=False)
+    _workspace: _Workspace = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Lay out the shared unknowns."""
@@ -110,7 +119,7 @@ class AdjustmentModel:
         object.__setattr__(self, "rig", rig)
         extra = 0 if self.robot is None else len(self.robot.labels)
         object.__setattr__(self, "shared", rig.stop + extra)
-        object.__setattr__(self, "_buffers", [])
+        object.__setattr__(self, "_workspace", _Workspace())
 
     @property
     def blocks(self) -> int:
@@ -203,7 +212,9 @@ class AdjustmentModel:
             missed = self.predicted(state, i, local, chunk)
             missed -= self.stations.pixels[i, chunk]
             whitened = self.stations.whitener[i, chunk] @ missed[..., None]
-            cost += apply_loss(self._mixed(whitened, chunk, seen), self.loss)
+            cost += apply_loss(
+                self.stations.decorrelated(whitened, chunk, seen), self.loss
+            )
         extra = 0 if self.robot is None else len(self.robot.labels)
         priors = self.root.shape[1] * self.present + self.sides.count + extra
         return Linearisation(
@@ -222,20 +233,6 @@ class AdjustmentModel:
         if self.sides.count:
             cost += float((self.sides.residuals(state.markers)[0] ** 2).sum())
         return cost
-
-    def _mixed(self, rows: Floats, chunk: slice, seen: Bools) -> Floats:
-        """Decorrelate whitened rows (c, w, 3, 2, q) of one marker seen twice."""
-        if self.stations.on_axis is None or self.stations.correlation == 0.0:
-            return rows
-        twice = seen[:, 0] & seen[:, 1] & self.stations.on_axis[chunk]
-        # Inverse symmetric square root of [[1, c], [c, 1]].
-        total = 1.0 / np.sqrt(1.0 + self.stations.correlation)
-        difference = 1.0 / np.sqrt(1.0 - self.stations.correlation)
-        same, other = 0.5 * (total + difference), 0.5 * (total - difference)
-        mixing = np.where(
-            twice[..., None, None], [[same, other], [other, same]], np.eye(2)
-        )
-        return np.asarray(np.einsum("bkuv,bvkpq->bukpq", mixing, rows))
 
     def rows(
         self, state: State
@@ -262,7 +259,12 @@ class AdjustmentModel:
                 seen = self.seen[i, chunk]
                 local = in_camera(state.base_from_camera[i], points, seen)
                 rows = self._camera_rows(state, i, chunk, local, by_shared)
-                yield chunk, i, np.r_[columns, tail], self._mixed(rows, chunk, seen)
+                yield (
+                    chunk,
+                    i,
+                    np.r_[columns, tail],
+                    self.stations.decorrelated(rows, chunk, seen),
+                )
 
     def _camera_rows(
         self, state: State, i: int, chunk: slice, local: Floats, by_shared: Floats
@@ -331,10 +333,17 @@ class AdjustmentModel:
     def equations(self, state: State) -> ChunkedEquations:
         """Normal equations at a state, in arrays that the next call fills anew."""
         size, g = self.own, self.shared
-        if not self._buffers:
-            shapes = ((size, size), (size, g), (size,))
-            self._buffers.extend(np.empty((self.blocks, *shape)) for shape in shapes)
-        own, cross, own_gradient = self._buffers
+        workspace = self._workspace
+        if workspace.equations is not None and workspace.state is state:
+            return workspace.equations
+        if workspace.arrays is None:
+            b = self.blocks
+            workspace.arrays = (
+                np.empty((b, size, size)),
+                np.empty((b, size, g)),
+                np.empty((b, size)),
+            )
+        own, cross, own_gradient = workspace.arrays
         shared, gradient = np.zeros((g, g)), np.zeros(g)
         own[:] = np.eye(size)
         cross[:] = 0.0
@@ -354,7 +363,9 @@ class AdjustmentModel:
             shared[np.ix_(place, place)] += total[:-1, :-1]
             gradient[place] += total[:-1, -1]
         self._add_priors(state, shared, gradient)
-        return ChunkedEquations(own, cross, shared, own_gradient, gradient)
+        equations = ChunkedEquations(own, cross, shared, own_gradient, gradient)
+        workspace.state, workspace.equations = state, equations
+        return equations
 
     def _add_priors(self, state: State, shared: Floats, gradient: Floats) -> None:
         if self.robot is not None:

@@ -91,3 +91,23 @@ class Stations:
     on_axis: Bools | None = None
     correlation: float = 0.0
     bending: Floats | None = None
+
+    def decorrelated(self, rows: Floats, chunk: slice, seen: Bools) -> Floats:
+        """Whiten rows of a marker that both stations see at the same place.
+
+        Args:
+            rows: Each already whitened alone, shape (c, w, 3, 2, q).
+            chunk: The c blocks.
+            seen: What one camera sees of them, shape (c, w, 3).
+        """
+        if self.on_axis is None or self.correlation == 0.0:
+            return rows
+        twice = seen[:, 0] & seen[:, 1] & self.on_axis[chunk]
+        # Inverse symmetric square root of [[1, c], [c, 1]].
+        total = 1.0 / np.sqrt(1.0 + self.correlation)
+        difference = 1.0 / np.sqrt(1.0 - self.correlation)
+        same, other = 0.5 * (total + difference), 0.5 * (total - difference)
+        mixing = np.where(
+            twice[..., None, None], [[same, other], [other, same]], np.eye(2)
+        )
+        return np.asarray(np.einsum("bkuv,bvkpq->bukpq", mixing, rows))

@@ -48,8 +48,8 @@ def unknown_labels(
 
 def check_determined(
     end: Minimum[State, Linearisation], cameras: Sequence[PinholeCamera]
-) -> float:
-    """Condition number of the shared unknowns' scaled information.
+) -> tuple[Floats, float]:
+    """Information on the shared unknowns (g, g), and its condition when scaled.
 
     Raises:
         DegenerateMotionError: the data do not determine them; names those that
@@ -78,7 +78,7 @@ def check_determined(
             f"{', '.join(owners)} trade against each other; turn the flange about "
             "two or more axes by at least 20 degrees, or estimate fewer unknowns"
         )
-    return float(values[-1] / values[0])
+    return information, float(values[-1] / values[0])
 
 
 def adjustment_result(
@@ -90,8 +90,7 @@ def adjustment_result(
 ) -> HandEyeCalibration:
     """Put a minimum into the record, see :func:`handeye_tri.adjust.adjust`."""
     state, model = end.state, end.blocks.model
-    condition = check_determined(end, start.cameras)
-    information = end.blocks.equations().reduced()
+    information, condition = check_determined(end, start.cameras)
     scale = 1.0 / np.sqrt(np.diagonal(information))
     shared = np.linalg.inv(information * np.outer(scale, scale))
     shared = 0.5 * (shared + shared.T) * np.outer(scale, scale)

@@ -1,0 +1,403 @@
+"""The joint adjustment against the Cramer-Rao bound, a wrong robot, and its cost.
+
+    python scripts/check_adjust.py --trials 300
+
+Projected points with noise: f 1720 px, baseline 0.25 m, 0.9 m away, 11 half-turns, a
+triangle of 120 and 130 mm, six held-out stations. The bound comes from numerical
+derivatives of the cameras' projections at the truth, not from the package's own
+Jacobians. NEES is the normalised estimation error squared per unknown: 1 where the
+stated covariance is right.
+"""
+
+import argparse
+import time
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+
+from handeye_tri import storage
+from handeye_tri.adjust import adjust, joint_offsets, link_corrections
+from handeye_tri.arm import Arm
+from handeye_tri.calibrate_cameras import calibrate_session_cameras
+from handeye_tri.camera import Intrinsics, PinholeCamera
+from handeye_tri.evaluate import evaluate_track
+from handeye_tri.hand_eye import calibrate_hand_eye
+from handeye_tri.plan import plan_motions
+from handeye_tri.records import (
+    MARKER_LABELS,
+    Covariance,
+    HandEyeCalibration,
+    Repeatability,
+    Station,
+    motion_labels,
+)
+from handeye_tri.se3 import SE3, se3_exp, se3_inverse
+from handeye_tri.simulate import compile_mechanism
+from handeye_tri.synthesize import Geometry, look_at, reference_geometry, synthesize
+
+ROWS = (
+    (0.03, 0.0, 0.0),
+    (0.1, 0.03, 0.005),
+    (0.2, 0.1, 0.02),
+    (0.5, 0.03, 0.005),
+)
+GEOMETRIES = 10
+ROBOT = Repeatability(3e-5, float(np.radians(0.005)))
+BLOCKS = ("left", "right", "base_from_left", "base_from_right",
+          "reference_from_right", "flange_from_triangle", "marker")  # fmt: skip
+SIZES = dict(zip(BLOCKS, (5, 5, 6, 6, 6, 6, 9), strict=True))
+
+
+def rough(truth, rng):
+    """A cell near the true one, to start from: 0.3 %, 1 mm, 2 mrad."""
+    spread = np.array([5, 5, 0.5, 3, 3])
+    cameras = tuple(
+        PinholeCamera(
+            camera.name,
+            Intrinsics.from_vector(
+                camera.intrinsics.vector + spread * rng.normal(size=5)
+            ),
+            camera.image_size,
+        )
+        for camera in truth.cameras
+    )  # fmt: skip
+
+    def moved(motion):
+        scale = np.repeat([1e-3, 2e-3], 3)
+        return motion @ SE3.exp(scale * rng.normal(size=6))
+
+    frame = moved(truth.flange_from_triangle)
+    points = truth.flange_from_triangle.inverse().apply(truth.markers)
+    return HandEyeCalibration(
+        cameras,
+        tuple(moved(motion) for motion in truth.base_from_camera),
+        frame,
+        frame.apply(points),
+        Covariance(("none.x",), np.eye(1)),
+        0.0,
+        1,
+        np.zeros((1, 6)),
+        "drawn",
+    )
+
+
+def forward(truth, poses, change, own):
+    """Pixels (m, n, 3, 2) with the 31 shared unknowns and each pose changed."""
+    poses = poses @ se3_exp(own)
+    markers = truth.markers + change[-9:].reshape(3, 3)
+    points = np.einsum("nab,kb->nka", poses[:, :3, :3], markers)
+    points = points + poses[:, None, :3, 3]
+    views = []
+    for i, camera in enumerate(truth.cameras):
+        step = change[11 * i : 11 * i + 11]
+        place = truth.base_from_camera[i] @ SE3.exp(step[5:])
+        vector = camera.intrinsics.vector + step[:5]
+        seen = PinholeCamera(
+            camera.name, Intrinsics.from_vector(vector), camera.image_size
+        )
+        views.append(seen.project(place.inverse().apply(points)))
+    return np.array(views)
+
+
+def slopes(truth, poses):
+    """Derivatives of pixels by the shared unknowns and by each pose, by differences."""
+    g = 31
+    step = np.r_[np.tile([*[1e-2] * 5, *[1e-5] * 6], 2), np.full(9, 1e-5)]
+    zero, still = np.zeros(g), np.zeros((len(poses), 6))
+    shared, own = [], []
+    for k in range(g):
+        change = step[k] * np.eye(g)[k]
+        plus = forward(truth, poses, change, still)
+        shared.append((plus - forward(truth, poses, -change, still)) / (2 * step[k]))
+    for k in range(6):
+        turn = 1e-5 * np.eye(6)[k]
+        plus = forward(truth, poses, zero, still + turn)
+        own.append((plus - forward(truth, poses, zero, still - turn)) / 2e-5)
+    return np.stack(shared, -1), np.stack(own, -1)
+
+
+def bound(session, truth, sigma_px, robot):
+    """Covariances of observed less reported that no unbiased estimator beats."""
+    reported = session.base_from_flange
+    kinds = np.array([station.kind == "calibration" for station in session.stations])
+    seen = np.isfinite(session.pixels)[..., None]
+    shared, own = slopes(truth, reported)
+    shared, own = (np.where(seen, slope, 0.0) / sigma_px for slope in (shared, own))
+    information = np.zeros((31, 31))
+    for j in np.flatnonzero(kinds):
+        by_shared, by_own = shared[:, j].reshape(-1, 31), own[:, j].reshape(-1, 6)
+        noise = np.eye(len(by_own)) + by_own @ robot.covariance @ by_own.T
+        information += by_shared.T @ np.linalg.solve(noise, by_shared)
+    scale = 1 / np.sqrt(np.diagonal(information))
+    covariance = np.linalg.inv(information * np.outer(scale, scale))
+    covariance *= np.outer(scale, scale)
+    parts = []
+    for j in np.flatnonzero(~kinds):
+        rotation = reported[j, :3, :3]
+        for k in range(3):
+            if not seen[:, j, k].all():
+                continue
+            # A point's slope is that of the pose's translation, turned into the base.
+            by_point = own[:, j, k].reshape(-1, 6)[:, :3] @ rotation.T
+            by_camera = shared[:, j, k].reshape(-1, 31).copy()
+            by_camera[:, -9:] = 0.0
+            inverse = np.linalg.inv(by_point.T @ by_point)
+            slope = -inverse @ by_point.T @ by_camera
+            slope[:, 22 + 3 * k : 25 + 3 * k] -= rotation
+            lever = truth.markers[k]
+            cross = np.cross(np.eye(3), lever).T
+            by_robot = rotation @ np.hstack([np.eye(3), -cross.T])
+            parts.append(
+                slope @ covariance @ slope.T
+                + inverse
+                + by_robot @ robot.covariance @ by_robot.T
+            )
+    return np.array(parts)
+
+
+def mean_length(covariances, rng):
+    """Mean length of normal errors with these covariances, m."""
+    roots = np.linalg.cholesky(covariances)
+    draws = roots @ rng.standard_normal((len(roots), 3, 4000))
+    return float(np.linalg.norm(draws, axis=1).mean())
+
+
+def truth_less_estimate(found, truth):
+    values = {}
+    motions = {"flange_from_triangle": (found.flange_from_triangle,
+                                        truth.flange_from_triangle)}  # fmt: skip
+    for i, (mine, true) in enumerate(zip(found.cameras, truth.cameras, strict=True)):
+        difference = true.intrinsics.vector - mine.intrinsics.vector
+        for name, value in zip(
+            ("fx", "fy", "skew", "cx", "cy"), difference, strict=True
+        ):
+            values[f"{mine.name}.{name}"] = value
+        pair = found.base_from_camera[i], truth.base_from_camera[i]
+        motions[f"base_from_{mine.name}"] = pair
+        motions[f"reference_from_{mine.name}"] = tuple(
+            cell.base_from_camera[0].inverse() @ motion
+            for cell, motion in zip((found, truth), pair, strict=True)
+        )
+    for owner, (mine, true) in motions.items():
+        tangent = (mine.inverse() @ true).log()
+        values |= dict(zip(motion_labels(owner), tangent, strict=True))
+    off = (truth.markers - found.markers).ravel()
+    return values | dict(zip(MARKER_LABELS, off, strict=True))
+
+
+def statistics(trials, separate):
+    print(
+        f"{trials} trials a row, {separate} of them by separate steps too; mean track "
+        "error, mm, and what else should be 1\n"
+        "px    robot mm/deg     separate  joint  bound  joint/bound rms  chi2/dof  "
+        "track/predicted  coverage 95 %"
+    )
+    tables = []
+    for sigma_px, mm, degrees in ROWS:
+        robot = Repeatability(1e-3 * mm, float(np.radians(degrees)))
+        rng = np.random.default_rng(0)
+        limits = []
+        scores = {name: [] for name in BLOCKS}
+        inside, joint, chi2, steps = [], [], [], []
+        for trial in range(trials):
+            geometry = reference_geometry(
+                np.random.default_rng([1, trial % GEOMETRIES])
+            )
+            session, truth = synthesize(
+                geometry,
+                np.random.default_rng([2, trial]),
+                sigma_px=sigma_px,
+                repeatability=robot,
+            )
+            if trial < GEOMETRIES:
+                parts = bound(session, truth, sigma_px, robot)
+                rms = np.sqrt(np.trace(parts, axis1=1, axis2=2).mean())
+                limits.append((mean_length(parts, rng), rms))
+            start = rough(truth, np.random.default_rng([3, trial]))
+            if trial < separate:
+                start = calibrate_hand_eye(session, calibrate_session_cameras(session))
+                steps.append(evaluate_track(start, session).mean)
+            found = adjust(session, start)
+            off = truth_less_estimate(found, truth)
+            for name in BLOCKS:
+                labels = [x for x in off if x.startswith(f"{name}.")
+                          or (name == "marker" and x in MARKER_LABELS)]  # fmt: skip
+                error = np.array([off[label] for label in labels])
+                matrix = found.covariance.block(labels)
+                scores[name].append(error @ np.linalg.solve(matrix, error) / len(error))
+                inside.append(np.abs(error) < 1.959964 * np.sqrt(np.diagonal(matrix)))
+            track = evaluate_track(found, session)
+            joint.append((track.mean, track.rms, track.predicted_rms))
+            chi2.append(found.chi2 / found.dof)
+        mean, rms, predicted = np.array(joint).T
+        limit = np.array([limits[t % GEOMETRIES] for t in range(trials)])
+        squares = np.sqrt((rms**2).mean())
+        print(
+            f"{sigma_px:<6}{mm:5} / {degrees:<8}{1e3 * np.mean(steps):9.3f}"
+            f"{1e3 * mean.mean():9.3f}{1e3 * limit[:, 0].mean():7.3f}"
+            f"{squares / np.sqrt((limit[:, 1] ** 2).mean()):12.3f}"
+            f"{np.mean(chi2):17.3f}"
+            f"{squares / np.sqrt((predicted**2).mean()):14.3f}"
+            f"{100 * np.concatenate(inside).mean():17.1f}"
+        )
+        tables.append(scores)
+    print("\nNEES +- its standard error   " + "  ".join(f"{r[0]} px" for r in ROWS))
+    for name in BLOCKS:
+        cells = [
+            f"{np.mean(scores[name]):.3f} +-{np.sqrt(2 / SIZES[name] / trials):.3f}"
+            for scores in tables
+        ]
+        print(f"{name:22}" + "  ".join(cells))
+
+
+def link_frames(arm, joints):
+    """base_from_link of every joint's body, (n, q, 4, 4)."""
+    bodies = [arm.mechanism.joints[k].body for k in arm.mechanism.arm_joints]
+    return arm.base_from_world.matrix @ arm.body_poses(joints)[:, bodies]
+
+
+def wrong_flange(arm, joints, corrections):
+    """Flange poses of an arm whose links end elsewhere by tangents (q, 6)."""
+    pose = arm.forward(joints)
+    links = link_frames(arm, joints)
+    # From the last link back: each correction moves everything beyond its link.
+    for k in reversed(range(len(corrections))):
+        frame = links[:, k]
+        pose = frame @ se3_exp(corrections[k]) @ se3_inverse(frame) @ pose
+    return pose
+
+
+def wrong_robot(seeds):
+    print(
+        "\nRobot with joint offsets of 0.05 deg and link errors of 0.2 mm, "
+        "0.03 px, 0.03 mm / 0.005 deg\n"
+        "unknowns            chi2/dof  track rms mm  over the bound  left at zero"
+    )
+    path = storage.find_cell("hp3_stereo")
+    cell = storage.read_cell(path)
+    arm = Arm(compile_mechanism(cell, storage.find_model(cell, path)))
+    rows = {name: [] for name in ("right robot", "repeatability", "joints", "links")}
+    left = {}
+    for seed in range(1, seeds + 1):
+        plan = plan_motions(cell, arm, seed)
+        joints = np.array([station.joints for station in plan.stations])
+        rng = np.random.default_rng([9, seed])
+        offsets = np.radians(0.05) * rng.choice([-1, 1], joints.shape[1])
+        links = link_frames(arm, joints)
+        bent = np.zeros((links.shape[1], 6))
+        bent[:, :3] = 2e-4 * rng.normal(size=(len(bent), 3)) / np.sqrt(3)
+        flange = arm.forward(joints)
+        turned = link_corrections(arm.joint_names, se3_inverse(flange)[:, None] @ links)
+        turned = turned.select(
+            [f"{j}.{axis}" for j in arm.joint_names for axis in "xyz"]
+        )
+        true = wrong_flange(arm, joints + offsets, bent)
+        for name, executed, parameters in (
+            ("right robot", flange, None),
+            ("repeatability", true, None),
+            ("joints", true, joint_offsets(arm.joint_names, arm.jacobian(joints))),
+            (
+                "links",
+                true,
+                joint_offsets(arm.joint_names, arm.jacobian(joints)) + turned,
+            ),
+        ):
+            geometry = Geometry(
+                cell.rig.triangle,
+                cell.rig.flange_from_triangle,
+                tuple(camera.camera for camera in cell.cameras),
+                tuple(arm.base_from_world @ c.world_from_camera for c in cell.cameras),
+                tuple(
+                    replace(s, base_from_flange=SE3(pose))
+                    for s, pose in zip(plan.stations, executed, strict=True)
+                ),
+                plan.half_turns,
+            )
+            session, truth = synthesize(
+                geometry, np.random.default_rng([8, seed]), sigma_px=0.03,
+                repeatability=ROBOT,
+            )  # fmt: skip
+            session = replace(session, stations=plan.stations)
+            start = rough(truth, np.random.default_rng([7, seed]))
+            found = adjust(session, start, robot_parameters=parameters)
+            track = evaluate_track(found, session, parameters)
+            rows[name].append((found.chi2 / found.dof, track.rms, track.predicted_rms))
+            left[name] = len(found.details["undetermined"])
+    limit = np.sqrt(np.mean([row[2] ** 2 for row in rows["right robot"]]))
+    for name, values in rows.items():
+        chi2, rms, _ = np.array(values).T
+        total = np.sqrt((rms**2).mean())
+        print(
+            f"{name:20}{chi2.mean():8.2f}{1e3 * total:14.3f}{total / limit:16.2f}"
+            f"{left[name]:14}"
+        )
+
+
+def crowd(cameras, stations):
+    """A session of many cameras and stations, and where to start."""
+    rng = np.random.default_rng(0)
+    base = reference_geometry(rng, half_turns=3, evaluation_stations=0)
+    target = np.array([0.45, 0.0, 0.42])
+    mine, places = [], []
+    for i in range(cameras):
+        angle = rng.uniform(-0.5, 0.5)
+        position = target + 0.95 * np.array([np.cos(angle), np.sin(angle), 0.2])
+        k = base.cameras[0].intrinsics.vector * rng.uniform(0.99, 1.01, 5)
+        mine.append(PinholeCamera(f"c{i}", Intrinsics.from_vector(k), (1024, 768)))
+        places.append(look_at(position, target))
+    nominal = np.array([s.base_from_flange.matrix for s in base.stations])
+    tangent = rng.uniform(-1, 1, (stations, 6)) * ([0.03] * 3 + [0.4] * 3)
+    poses = nominal[rng.integers(0, len(nominal), stations)] @ se3_exp(tangent)
+    geometry = Geometry(
+        base.triangle,
+        base.flange_from_triangle,
+        tuple(mine),
+        tuple(places),
+        tuple(
+            Station(j, "calibration", np.empty(0), SE3(pose))
+            for j, pose in enumerate(poses)
+        ),
+        (),
+    )
+    session, truth = synthesize(geometry, rng, sigma_px=0.1, repeatability=ROBOT)
+    return session, rough(truth, rng)
+
+
+def cost(counts):
+    print("\ncameras  stations  cpu s  passes  us a view and pass  peak B a view")
+    for cameras, stations in counts:
+        session, start = crowd(cameras, stations)
+        views = cameras * stations
+        best = np.inf
+        for _ in range(3):
+            started = time.process_time()
+            found = adjust(session, start)
+            best = min(best, time.process_time() - started)
+        tracemalloc.start()
+        adjust(session, start)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        passes = found.details["iterations"] + 1
+        print(
+            f"{cameras:7}{stations:10}{best:7.2f}{passes:8}"
+            f"{1e6 * best / views / passes:20.2f}{peak / views:15.0f}"
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--trials", type=int, default=300)
+    parser.add_argument("--separate", type=int, default=30)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--stations", type=int, default=100_000)
+    options = parser.parse_args()
+    statistics(options.trials, options.separate)
+    wrong_robot(options.seeds)
+    cost(
+        ((2, 22), (2, 1000), (2, 10_000), (2, options.stations), (1, 1000), (64, 1000))
+    )
+
+
+if __name__ == "__main__":
+    main()
