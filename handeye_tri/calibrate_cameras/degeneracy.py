@@ -35,6 +35,14 @@ _CHANCE = 1e-3
 # A focal length whose sigma is a larger part of it than this is not determined: four
 # sigmas reach zero and infinity, and sigma itself means nothing.
 _MAX_RELATIVE_SIGMA = 0.25
+# One whose sigma is larger than this is weak, and said to be.
+_WEAK_RELATIVE_SIGMA = 0.02
+# Sides over the image's longer side, tilt, spread and number below which each is named
+# as a cause.
+_SMALL_PART = 0.08
+_LOW_TILT_DEG = 15.0
+_LOW_SPREAD_DEG = 20.0
+_FEW = 6
 # Scaled information worse conditioned than this is singular in double precision.
 _MAX_CONDITION = 1e13
 # Noise that is assumed at least where the residuals are at rounding, pixels.
@@ -216,7 +224,11 @@ def scaled_condition(information: Floats) -> float:
 
 
 def check_determined(
-    condition: float, focal: Floats, sigma: Floats, spread_deg: float
+    condition: float,
+    focal: Floats,
+    sigma: Floats,
+    spread_deg: float,
+    data: HalfTurnData,
 ) -> None:
     """Refuse a focal length that the data do not determine.
 
@@ -225,9 +237,10 @@ def check_determined(
         focal: fx and fy, shape (2,), pixels.
         sigma: Their predicted standard deviations, shape (2,), pixels.
         spread_deg: Largest angle between two planes, degrees.
+        data: The half-turns.
 
     Raises:
-        DegenerateMotionError: says sigma, spread and condition.
+        DegenerateMotionError: says sigma, spread, condition and the triangle's size.
     """
     relative = float((sigma / focal).max()) if np.isfinite(sigma).all() else np.inf
     if condition <= _MAX_CONDITION and relative <= _MAX_RELATIVE_SIGMA:
@@ -236,9 +249,61 @@ def check_determined(
         f"the half-turns do not determine the focal length: fx {focal[0]:.1f} px with "
         f"a predicted sigma of {sigma[0]:.3g} px, fy {focal[1]:.1f} with "
         f"{sigma[1]:.3g} (condition {condition:.2g}, planes spread by "
-        f"{spread_deg:.1f} degrees); use at least three different planes, 20 degrees "
-        "or more apart, and a triangle that is larger in the image"
+        f"{spread_deg:.1f} degrees, sides of {np.median(_side_px(data)):.0f} px in the "
+        f"image, {len(data)} half-turns); use at least three different planes, 20 "
+        "degrees or more apart, and a triangle that is larger in the image"
     )
+
+
+def weaknesses(
+    data: HalfTurnData, normals: Floats, focal: Floats, sigma: Floats, condition: float
+) -> tuple[str, ...]:
+    """What makes a camera that is determined a weakly determined one.
+
+    Args:
+        data: The half-turns.
+        normals: Unit normals of the planes in the camera's frame, shape (n, 3).
+        focal: fx and fy, shape (2,), pixels.
+        sigma: Their predicted standard deviations, shape (2,), pixels.
+        condition: Of the scaled information on the shared unknowns.
+
+    Returns:
+        One sentence per cause, with the numbers and the remedy; none where both focal
+        lengths are known to a fiftieth.
+    """
+    relative = float((sigma / focal).max())
+    if relative <= _WEAK_RELATIVE_SIGMA:
+        return ()
+    side = float(np.median(_side_px(data)))
+    spread = plane_spread_deg(normals)
+    tilt = float(np.degrees(np.arccos(np.abs(normals[:, 2]).clip(0.0, 1.0))).max())
+    n = len(data)
+    part = side / max(data.image_size)
+    causes = []
+    if part < _SMALL_PART:
+        causes.append(
+            f"the triangle's sides are {side:.0f} px, {100 * part:.0f} % of the image: "
+            "sigma falls with the square of the size, so bring it nearer or enlarge it"
+        )
+    if tilt < _LOW_TILT_DEG:
+        causes.append(
+            f"the triangle faces the camera, tilted by {tilt:.0f} degrees at most: "
+            "tilt it by 30 to 60 degrees"
+        )
+    elif spread < _LOW_SPREAD_DEG:
+        causes.append(
+            f"the planes differ by {spread:.0f} degrees at most: turn the triangle so "
+            "that they differ by 20 or more"
+        )
+    if n < _FEW:
+        causes.append(f"there are {n} half-turns: use {_FEW} or more")
+    if not causes:
+        causes.append("the noise is large: average images, or add half-turns")
+    head = (
+        f"fx {focal[0]:.1f} +- {sigma[0]:.2g} px, fy {focal[1]:.1f} +- {sigma[1]:.2g} "
+        f"px (plane spread {spread:.1f} degrees, condition {condition:.2g})"
+    )
+    return tuple(f"{head}: {cause}" for cause in causes)
 
 
 def least_noise(chi2_per_dof: float, noise_known: bool) -> float:

@@ -23,6 +23,7 @@ from handeye_tri.calibrate_cameras.degeneracy import (
     invert_information,
     least_noise,
     plane_spread_deg,
+    weaknesses,
 )
 from handeye_tri.calibrate_cameras.half_turns import HalfTurnData, read_half_turns
 from handeye_tri.calibrate_cameras.homography import (
@@ -152,6 +153,8 @@ def calibrate_camera(
           where there is a turn_covariance;
         - "lens_verdict": a :class:`LensVerdict` for each lens coefficient estimated:
           its effect in pixels, that of its sigma, and whether it is determined;
+        - "weaknesses": sentences on what makes fx or fy uncertain by more than a
+          fiftieth (a small target, low tilt, few half-turns), and the remedy;
         - "dropped": with ``reject``, why each half-turn was dropped, by index;
         - "used": indices of the half-turns used; "plane_spread_deg"; "start";
           "iterations".
@@ -286,6 +289,7 @@ class _Outcome:
     cost_start: float
     start: str
     iterations: int
+    weaknesses: tuple[str, ...]
 
 
 def _stop_at_closed_form(
@@ -308,9 +312,9 @@ def _stop_at_closed_form(
     covariance = chosen.T @ first.covariance @ chosen
     _, condition = invert_information(NormalEquations.of(blocks).reduced())
     sigma = _focal_sigma(model, covariance, least_noise(noise, noise_known))
-    check_determined(
-        condition, state.intrinsics[:2], sigma, plane_spread_deg(state.poses[:, :3, 2])
-    )
+    normals = state.poses[:, :3, 2]
+    focal = state.intrinsics[:2]
+    check_determined(condition, focal, sigma, plane_spread_deg(normals), model.data)
     return _Outcome(
         state,
         covariance * (1.0 if noise_known else noise),
@@ -319,6 +323,7 @@ def _stop_at_closed_form(
         blocks.cost,
         "closed form",
         0,
+        weaknesses(model.data, normals, focal, sigma, condition),
     )
 
 
@@ -343,9 +348,9 @@ def _refined(
     count = model.camera_unknowns
     covariance = covariance[:count, :count]
     noise = end.cost / model.dof
-    spread = plane_spread_deg(state.poses[:, :3, 2])
+    normals, focal = state.poses[:, :3, 2], state.intrinsics[:2]
     sigma = _focal_sigma(model, covariance, least_noise(noise, noise_known))
-    check_determined(condition, state.intrinsics[:2], sigma, spread)
+    check_determined(condition, focal, sigma, plane_spread_deg(normals), model.data)
     if not end.converged:
         raise ConvergenceError(
             f"the refinement did not settle in {end.iterations} iterations (chi2 "
@@ -362,6 +367,7 @@ def _refined(
         end.cost_start if closed_cost is None else closed_cost.cost,
         list(starts)[chosen],
         end.iterations,
+        weaknesses(model.data, normals, focal, sigma, condition),
     )
 
 
@@ -396,6 +402,7 @@ def _details(
         "plane_spread_deg": plane_spread_deg(state.poses[:, :3, 2]),
         "start": outcome.start,
         "iterations": outcome.iterations,
+        "weaknesses": outcome.weaknesses,
     }
     if model.turn_root is not None:
         result["turn_sigmas"] = whole(state.turn)

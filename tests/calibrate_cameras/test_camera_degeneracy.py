@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from half_turn_scene import IMAGE_SIZE, TRIANGLE, make_scene
@@ -109,6 +111,40 @@ def test_views_too_weak_for_the_noise_are_refused_with_sigma() -> None:
     scene = make_scene(rng, 3, tilt_deg=(2.0, 5.0), azimuths=[0.0, 2.0, 4.0])
     with pytest.raises(DegenerateMotionError, match="predicted sigma of"):
         calibrate(scene, *scene.noisy(rng, 0.4), sigma_px=0.4)
+
+
+@pytest.mark.parametrize(
+    ("n", "scale", "tilt", "sigma", "words"),
+    [
+        (12, 0.25, (20.0, 55.0), 0.1, "% of the image: sigma falls with the square"),
+        (12, 1.0, (7.0, 11.0), 0.2, "faces the camera, tilted by 1. degrees at most"),
+        (4, 1.0, (20.0, 30.0), 0.3, "there are 4 half-turns: use 6 or more"),
+        (12, 1.0, (25.0, 40.0), 2.5, "the noise is large"),
+    ],
+)
+@pytest.mark.parametrize("refine", [False, True])
+def test_weak_data_say_why_and_what_to_do(n, scale, tilt, sigma, words, refine) -> None:
+    small = TriangleRig(
+        scale * TRIANGLE.side_ab, scale * TRIANGLE.side_ac, TRIANGLE.angle
+    )
+    foot = (scale * 0.05, scale * 0.035)
+    rng = np.random.default_rng(20)
+    scene = make_scene(rng, n, triangle=small, foot=foot, tilt_deg=tilt)
+    result = calibrate(scene, *scene.noisy(rng, sigma), sigma_px=sigma, refine=refine)
+    found = result.details["weaknesses"]
+    assert any(re.search(words, sentence) for sentence in found), found
+    spread = f"plane spread {result.details['plane_spread_deg']:.1f} degrees"
+    assert all(
+        spread in sentence and f"condition {result.condition:.2g}" in sentence
+        for sentence in found
+    )
+
+
+def test_good_data_have_no_weakness() -> None:
+    rng = np.random.default_rng(21)
+    scene = make_scene(rng, 12)
+    result = calibrate(scene, *scene.noisy(rng, 0.1), sigma_px=0.1)
+    assert result.details["weaknesses"] == ()
 
 
 def test_closed_form_that_is_no_camera_is_an_error_and_refinement_survives_it() -> None:
