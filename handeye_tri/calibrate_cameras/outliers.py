@@ -41,7 +41,7 @@ Indices = NDArray[np.intp]
 
 # Part of the half-turns that must agree.
 _MAJORITY = 0.75
-_SUBSETS = 150
+_SUBSETS = 60
 # Chance that a good half-turn is dropped, if noise is normal and as stated.
 _CHANCE = 1e-5
 # Observations of a half-turn less its pose, camera and O being known.

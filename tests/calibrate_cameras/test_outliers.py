@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from half_turn_scene import IMAGE_SIZE, half_turn, make_scene, project
+from half_turn_damage import (
+    SIGMA,
+    repeated,
+    swapped,
+    turned_by_170,
+    wrong_point,
+)
+from half_turn_scene import IMAGE_SIZE, make_scene
 
 from handeye_tri.calibrate_cameras import calibrate_camera
 from handeye_tri.errors import DegenerateMotionError, InputError
-
-SIGMA = 0.2
 
 
 def calibrate(scene, before, after, **options):
@@ -20,35 +25,6 @@ def calibrate(scene, before, after, **options):
         image_size=IMAGE_SIZE,
         **{"axis": scene.axes, "sigma_px": SIGMA, **options},
     )
-
-
-def wrong_point(scene, before, after, i, rng):
-    del scene
-    view, angle = (before, after)[rng.integers(2)], rng.uniform(0, 2 * np.pi)
-    shift = rng.uniform(8, 60) * np.array([np.cos(angle), np.sin(angle)])
-    view[i, rng.integers(3)] += shift
-    view[i] = np.clip(view[i], 0, np.array(IMAGE_SIZE) - 1)
-    return "px off|degrees|explains it"
-
-
-def swapped(scene, before, after, i, rng):
-    del scene, before
-    after[i] = after[i][[[1, 0, 2], [2, 1, 0], [0, 2, 1]][rng.integers(3)]]
-    return "labels exchanged"
-
-
-def repeated(scene, before, after, i, rng):
-    del scene
-    after[i] = before[i] + SIGMA * rng.integers(2) * rng.standard_normal((3, 2))
-    return "same image|triangle unturned"
-
-
-def turned_by_170(scene, before, after, i, rng):
-    del before
-    motion = half_turn(scene.triangle, scene.axes[i], scene.foot, 170.0)
-    after[i] = project(scene.camera, scene.triangle, scene.poses[i] @ motion)
-    after[i] += SIGMA * rng.standard_normal((3, 2))
-    return "a turn of 1|px off|explains it"
 
 
 @pytest.mark.parametrize("axis", ["normal", "CA"])
