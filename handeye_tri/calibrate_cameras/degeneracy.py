@@ -229,6 +229,7 @@ def check_determined(
     sigma: Floats,
     spread_deg: float,
     data: HalfTurnData,
+    coefficients: int,
 ) -> None:
     """Refuse a focal length that the data do not determine.
 
@@ -238,6 +239,7 @@ def check_determined(
         sigma: Their predicted standard deviations, shape (2,), pixels.
         spread_deg: Largest angle between two planes, degrees.
         data: The half-turns.
+        coefficients: How many lens coefficients are estimated.
 
     Raises:
         DegenerateMotionError: says sigma, spread, condition and the triangle's size.
@@ -245,6 +247,13 @@ def check_determined(
     relative = float((sigma / focal).max()) if np.isfinite(sigma).all() else np.inf
     if condition <= _MAX_CONDITION and relative <= _MAX_RELATIVE_SIGMA:
         return
+    if coefficients > 2 and (relative <= _MAX_RELATIVE_SIGMA or np.isinf(relative)):
+        raise DegenerateMotionError(
+            f"the half-turns do not tell {coefficients} lens coefficients apart "
+            f"(condition {condition:.2g}, of fx alone a predicted sigma of "
+            f'{sigma[0]:.3g} px); estimate fewer, as distortion=("k1", "k2"), give '
+            "the others in fixed, or add views with the triangle in the image's corners"
+        )
     raise DegenerateMotionError(
         f"the half-turns do not determine the focal length: fx {focal[0]:.1f} px with "
         f"a predicted sigma of {sigma[0]:.3g} px, fy {focal[1]:.1f} with "

@@ -314,7 +314,14 @@ def _stop_at_closed_form(
     sigma = _focal_sigma(model, covariance, least_noise(noise, noise_known))
     normals = state.poses[:, :3, 2]
     focal = state.intrinsics[:2]
-    check_determined(condition, focal, sigma, plane_spread_deg(normals), model.data)
+    check_determined(
+        condition,
+        focal,
+        sigma,
+        plane_spread_deg(normals),
+        model.data,
+        len(model.lens),
+    )
     return _Outcome(
         state,
         covariance * (1.0 if noise_known else noise),
@@ -350,7 +357,14 @@ def _refined(
     noise = end.cost / model.dof
     normals, focal = state.poses[:, :3, 2], state.intrinsics[:2]
     sigma = _focal_sigma(model, covariance, least_noise(noise, noise_known))
-    check_determined(condition, focal, sigma, plane_spread_deg(normals), model.data)
+    check_determined(
+        condition,
+        focal,
+        sigma,
+        plane_spread_deg(normals),
+        model.data,
+        len(model.lens),
+    )
     if not end.converged:
         raise ConvergenceError(
             f"the refinement did not settle in {end.iterations} iterations (chi2 "

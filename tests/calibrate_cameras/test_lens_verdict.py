@@ -7,6 +7,7 @@ from half_turn_scene import IMAGE_SIZE, camera, make_scene
 
 from handeye_tri.calibrate_cameras import calibrate_camera
 from handeye_tri.camera import Lens
+from handeye_tri.errors import ConvergenceError, DegenerateMotionError
 
 
 def verdicts(scene, rng, sigma, names):
@@ -74,3 +75,20 @@ def test_rational_lens_is_judged_too() -> None:
     assert found["k1"].sigma_px > 0
     assert found["k4"].sigma_px > 0
     assert result.chi2 < result.dof + 5 * np.sqrt(2 * result.dof)
+
+
+def test_coefficients_that_cannot_be_told_apart_are_said_to_be_the_lens() -> None:
+    scene = make_scene(np.random.default_rng(7), 14, tilt_deg=(20.0, 40.0))
+    said = []
+    for seed in range(4):
+        rng = np.random.default_rng([8, seed])
+        try:
+            _, found = verdicts(scene, rng, 0.1, "rational")
+        except (DegenerateMotionError, ConvergenceError) as error:
+            said.append(str(error))
+        else:
+            # A lens that is not there: most of its eight coefficients are noise.
+            assert sum(not verdict.determined for verdict in found.values()) >= 2
+    assert said
+    assert all("estimate fewer" in text for text in said)
+    assert any("do not tell 8 lens coefficients apart" in text for text in said)
