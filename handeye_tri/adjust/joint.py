@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 # Correlations of detection errors that are tried where markers lie on the axis.
-_CORRELATIONS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
+_CORRELATIONS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 0.96, 0.985)
 
 
 def adjust(
