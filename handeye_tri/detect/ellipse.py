@@ -186,6 +186,8 @@ def fit_ellipses(
         model, jacobian, slope, behind = _covers(edge, ellipses)
         residual = covers - model
         information = edge.sums(slope * slope)
+        # A direction of a small ball may have no pixel on the edge itself.
+        least = 0.25 * information.mean(axis=1, keepdims=True) + 1e-9
         many = edge.sums(behind)
         # Nothing lies behind the edge of an ellipse that has run away.
         noise = np.array(
@@ -209,7 +211,7 @@ def fit_ellipses(
                 step[k] = np.linalg.solve(normal, weighted[:, part] @ residual[part])
                 left[part] = residual[part] - step[k] @ jacobian[:, part]
             # How far out of the fit the edge lies in each direction, px.
-            out = edge.sums(slope * left) / np.maximum(information, 1e-9)
+            out = edge.sums(slope * left) / np.maximum(information, least)
             limit = _TRIM_SIGMAS * MAD * medians(np.abs(out), shown)
             limit = np.maximum(limit, _TRIM_FLOOR)[:, None]
             # Something else may begin right behind the edge.
@@ -226,7 +228,7 @@ def fit_ellipses(
     # White noise of variance v in each of k directions has the power k v.
     variance = power.mean(axis=1) / count
     variance *= (information * shown).sum(axis=1) / count
-    expected = (noise**2)[:, None] * shown / np.maximum(information, 1e-9)
+    expected = (noise**2)[:, None] * shown / np.maximum(information, least)
     expected = expected.sum(axis=1) / count
     covariance = np.empty((m, 2, 2))
     for k, part in enumerate(own):
