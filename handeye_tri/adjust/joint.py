@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from handeye_tri.adjust.model import AdjustmentModel, Linearisation
 from handeye_tri.adjust.problem import Sides, State, Stations
@@ -95,6 +97,27 @@ def adjust(
         ConvergenceError: the iteration did not settle.
     """
     _check(session, start, side_sigma, robot_parameters, on_axis_correlation)
+    # Products of a few hundred numbers a side: threads cost more than they bring.
+    with _blas().limit(limits=1):
+        return _adjusted(
+            session, start, side_sigma, loss, robot_parameters, on_axis_correlation
+        )
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """The libraries behind numpy, found once."""
+    return ThreadpoolController().select(user_api="blas")
+
+
+def _adjusted(
+    session: Session,
+    start: HandEyeCalibration,
+    side_sigma: float,
+    loss: Loss | None,
+    robot_parameters: RobotParameters | None,
+    on_axis_correlation: float | None,
+) -> HandEyeCalibration:
     edge = any(turn.axis != "normal" for turn in session.half_turns)
     estimate = on_axis_correlation is None and edge
     correlation = 0.0 if on_axis_correlation is None else on_axis_correlation
