@@ -10,10 +10,11 @@ from handeye_tri.detect.ellipse import Indices
 from handeye_tri.detect.identity import assign
 from handeye_tri.detect.markers import Detection, MarkerSpec, Reason, chroma
 from handeye_tri.detect.outline import Outlines, measure
+from handeye_tri.detect.sheet import detection_sheet
 from handeye_tri.errors import InputError
 from handeye_tri.records import Floats
 
-__all__ = ["Detection", "MarkerSpec", "detect_markers"]
+__all__ = ["Detection", "MarkerSpec", "detect_markers", "detection_sheet"]
 
 Image = NDArray[np.uint8]
 

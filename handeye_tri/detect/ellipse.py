@@ -181,7 +181,8 @@ def fit_ellipses(
     own = [slice(edge.starts[k], edge.starts[k + 1]) for k in range(m)]
     offered = (edge.weight > 0).reshape(m, RAYS)
     shown = offered & trusted
-    step, left = np.empty((m, 6)), np.empty(len(covers))
+    normal, right = np.empty((m, 6, 6)), np.empty((m, 6, 1))
+    left = np.empty(len(covers))
     for steps in _STEPS:
         model, jacobian, slope, behind = _covers(edge, ellipses)
         residual = covers - model
@@ -189,13 +190,7 @@ def fit_ellipses(
         # A direction of a small ball may have no pixel on the edge itself.
         least = 0.25 * information.mean(axis=1, keepdims=True) + 1e-9
         many = edge.sums(behind)
-        # Nothing lies behind the edge of an ellipse that has run away.
-        noise = np.array(
-            [
-                MAD * np.median(np.abs(np.append(residual[k][behind[k] > 0], 0.0)))
-                for k in own
-            ]
-        )
+        noise = np.array([_scatter(residual[k][behind[k] > 0]) for k in own])
         surplus = np.maximum(
             _MAX_SURPLUS * many, _TRIM_SIGMAS * noise[:, None] * np.sqrt(many)
         )
@@ -205,10 +200,12 @@ def fit_ellipses(
             counted = (edge.weight * shown.ravel())[edge.ray]
             weighted = counted * jacobian
             for k, part in enumerate(own):
-                normal = weighted[:, part] @ jacobian[:, part].T
-                # Keeps an outline without usable pixels from being singular.
-                normal += _NEARLY_NOTHING
-                step[k] = np.linalg.solve(normal, weighted[:, part] @ residual[part])
+                normal[k] = weighted[:, part] @ jacobian[:, part].T
+                right[k, :, 0] = weighted[:, part] @ residual[part]
+            # Keeps an outline without usable pixels from being singular.
+            normal += _NEARLY_NOTHING
+            step = np.linalg.solve(normal, right)[..., 0]
+            for k, part in enumerate(own):
                 left[part] = residual[part] - step[k] @ jacobian[:, part]
             # How far out of the fit the edge lies in each direction, px.
             out = edge.sums(slope * left) / np.maximum(information, least)
@@ -231,11 +228,9 @@ def fit_ellipses(
     expected = (noise**2)[:, None] * shown / np.maximum(information, least)
     expected = expected.sum(axis=1) / count
     covariance = np.empty((m, 2, 2))
+    inverse = np.linalg.inv(normal)
     for k, part in enumerate(own):
-        inverse = np.linalg.inv(
-            weighted[:, part] @ jacobian[:, part].T + _NEARLY_NOTHING
-        )
-        pull = inverse[:2] @ weighted[:, part]
+        pull = inverse[k, :2] @ weighted[:, part]
         covariance[k] = variance[k] * (pull @ pull.T) + _MODEL_ERROR**2 * np.eye(2)
     return EllipseFit(
         ellipses,
@@ -245,6 +240,12 @@ def fit_ellipses(
         (offered & (out < -limit)).mean(axis=1),
         (offered & (np.abs(out) > limit)).mean(axis=1),
     )
+
+
+def _scatter(values: Floats) -> float:
+    """Robust standard deviation about zero of values, shape (n,); 0 of none."""
+    ordered = np.sort(np.abs(values))
+    return MAD * float(ordered[len(ordered) // 2]) if len(ordered) else 0.0
 
 
 def _covers(edge: Edge, ellipses: Floats) -> tuple[Floats, Floats, Floats, Floats]:

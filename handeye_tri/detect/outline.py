@@ -28,7 +28,8 @@ from handeye_tri.detect.ellipse import (
 from handeye_tri.detect.markers import Reason
 from handeye_tri.records import Floats
 
-# Levels between pixels: points (m, rays, s, 2) of m spots to levels (m, rays, s).
+# Levels between pixels: m spots (m,) and points (m, rays, s, 2) to levels
+# (m, rays, s).
 Sampler = Callable[[Indices, Floats], Floats]
 # Levels of pixels: spot, row and column of each, all (n,), to levels (n,).
 Reader = Callable[[Indices, Indices, Indices], Floats]
