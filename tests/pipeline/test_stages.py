@@ -144,6 +144,24 @@ def test_a_stage_done_again_writes_the_same_bytes(session, verb):
     assert digests(session) == before
 
 
+def test_separate_steps_on_request_and_back(session):
+    before = digests(session)
+    methods, tracks = [], []
+    for arguments in (("--method", "separate"), ()):
+        for verb, more in (("calibrate", arguments), ("evaluate", ())):
+            done = command(verb, session, *more)
+            assert done.returncode == 0, done.stderr
+        written = json.loads((session / "hand_eye.json").read_text())
+        methods.append(written["method"])
+        tracks.append(evaluation(session)["track"]["predicted_rms_mm"])
+    assert methods[0].startswith("AX=ZB")
+    assert methods[1].startswith("joint adjustment")
+    assert "separate" in written["base_from_reference_by_method"]
+    assert tracks[1] < tracks[0]
+    # Another method is other numbers in hand_eye.json; the same, the same bytes.
+    assert digests(session) == before
+
+
 def test_json_is_the_evaluation_and_nothing_else(session):
     done = command("run", "hp3_stereo", "-o", session, "--seed", "1", "--json")
     assert json.loads(done.stdout) == evaluation(session)
