@@ -11,6 +11,13 @@ from handeye_tri.records.covariance import (
     Covariance,
     motion_labels,
 )
+from handeye_tri.records.pose_pairs import (
+    Mounting,
+    ObservedDirection,
+    PoseNoise,
+    PosePairs,
+    RobotDirection,
+)
 from handeye_tri.records.results import (
     CameraCalibration,
     GroundTruth,
@@ -34,6 +41,11 @@ __all__ = [
     "MOTION_QUANTITIES",
     "Covariance",
     "motion_labels",
+    "Mounting",
+    "ObservedDirection",
+    "PoseNoise",
+    "PosePairs",
+    "RobotDirection",
     "CameraCalibration",
     "GroundTruth",
     "HandEyeCalibration",
