@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handeye_tri.errors import DegenerateMotionError, InputError
+from handeye_tri.hand_eye.consensus import find_consensus
 from handeye_tri.hand_eye.degeneracy import require_determined
 from handeye_tri.hand_eye.motions import check_pairs
 from handeye_tri.hand_eye.refine import Refinement, refine_axzb
@@ -30,6 +31,8 @@ def solve_axzb(
     method: AbsoluteMethod = "shah",
     covariance_a: ArrayLike | None = None,
     covariance_b: ArrayLike | None = None,
+    robust: bool = False,
+    seed: int = 0,
 ) -> tuple[SE3, SE3]:
     """Solve ``a_i X = Z b_i`` for the two rigid motions; cost linear in i.
 
@@ -50,6 +53,10 @@ def solve_axzb(
             rad; only for "refined". Without any covariance, one translational and
             one rotational noise level are estimated from the residuals.
         covariance_b: The same for b_i.
+        robust: Whether poses that most others contradict are left out first
+            (consensus of random samples; up to half may be wrong). Which ones, and
+            everything else about the solution: :func:`solve_pose_pairs`.
+        seed: Of the random samples; the same seed gives the same result.
 
     Returns:
         X and Z.
@@ -70,6 +77,11 @@ def solve_axzb(
         raise InputError(
             f'method "{method}" takes no covariance; use method="refined" or drop it'
         )
+    n = len(left)
+    kept: slice | NDArray[np.bool_] = slice(None)
+    if robust:
+        kept = find_consensus(left, right, seed=seed).agreeing
+        left, right = left[kept], right[kept]
     x, z = _shah(left, right)
     if method == "li":
         x, z = _li(left, right)
@@ -80,8 +92,8 @@ def solve_axzb(
                 right,
                 x,
                 z,
-                _covariances("covariance_a", covariance_a, len(left)),
-                _covariances("covariance_b", covariance_b, len(left)),
+                _covariances("covariance_a", covariance_a, n)[kept],
+                _covariances("covariance_b", covariance_b, n)[kept],
             )
             if given
             else _refine_unknown_noise(left, right, x, z)

@@ -35,6 +35,8 @@ _MIN_RATIO = 4.0
 # are all half-turns within the first angle must have axes out of plane by the second.
 _HALF_TURN = np.radians(179.0)
 _OUT_OF_PLANE = np.radians(2.0)
+# Axes that spread by this are not parallel: then the two sides contradict each other.
+_SPREAD = np.radians(20.0)
 _HALF_TURN_TRACE = 1.0 + 2.0 * np.cos(_HALF_TURN)
 _NO_TURN_TRACE = 1.0 + 2.0 * np.cos(np.radians(18.0))
 
@@ -99,6 +101,13 @@ def require_determined(
             f"or at right angles ({numbers}): each axis has two signs, so the solution "
             "is ambiguous; add one motion that is not a half-turn, or half-turns whose "
             "axes leave the plane"
+        )
+    if off_line > np.sin(_SPREAD):
+        raise DegenerateMotionError(
+            f"no rotation fits: {numbers}, although the axes spread by "
+            f"{np.degrees(np.arcsin(min(off_line, 1.0))):.3g} degrees RMS; a and b "
+            "contradict each other: check that a[i] and b[i] belong together, which "
+            "way each maps, and leave wrong poses out (robust=True)"
         )
     axis = ", ".join(f"{x:+.3f}" for x in directions[:, 2])
     raise DegenerateMotionError(
