@@ -12,8 +12,14 @@ from handeye_tri.storage.files import (
     write_json,
 )
 from handeye_tri.storage.folder import SessionFolder, decoded, fingerprint
+from handeye_tri.storage.pose_files import (
+    POSES_SCHEMA,
+    read_moveit_samples,
+    read_pose_pairs,
+)
 
 __all__ = [
+    "POSES_SCHEMA",
     "SessionFolder",
     "decoded",
     "find_cell",
@@ -23,6 +29,8 @@ __all__ = [
     "read_cell",
     "read_image",
     "read_json",
+    "read_moveit_samples",
+    "read_pose_pairs",
     "sha256",
     "shipped",
     "write_arrays",
