@@ -32,7 +32,7 @@ ROWS: tuple[tuple[str, ...], ...] = (
     ("evaluate", "diagnose"),
     # The words on the terminal, in the report and in the recording are the same.
     ("summary",),
-    ("report", "replay", "sweep"),
+    ("report", "replay", "sweep", "solve"),
     ("doctor",),
     ("pipeline",),
     # Fig. 12 is a whole run of the pipeline.

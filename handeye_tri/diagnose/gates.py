@@ -7,6 +7,7 @@ is met, FAIL when one is not, CANNOT TELL when the data cannot decide.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,6 +15,8 @@ import numpy as np
 
 GateVerdict = Literal["good", "marginal", "bad", "not run"]
 Outcome = Literal["PASS", "FAIL", "CANNOT TELL"]
+# Code, cause, what to do.
+Remedy = tuple[str, str, str]
 
 # Within this share of its limit a gate that is met is called marginal.
 _MARGINAL = 0.85
@@ -213,7 +216,7 @@ def touch_gate() -> Gate:
     return Gate("touch test", "-", "-", "not run", "the real task", "-")
 
 
-_REMEDIES = {
+_REMEDIES: dict[str, Remedy] = {
     "half-turns as executed": (
         "HALF_TURN",
         "a half-turn was not a turn by 180 degrees about the stated axis",
@@ -247,13 +250,20 @@ _REMEDIES = {
 }
 
 
-def judge(gates: tuple[Gate, ...], sentence: str) -> Verdict:
+def judge(
+    gates: tuple[Gate, ...],
+    sentence: str,
+    remedies: Mapping[str, Remedy] | None = None,
+) -> Verdict:
     """Draw the verdict from the gates.
 
     Args:
         gates: All gates, those not run included.
         sentence: The headline in millimetres, true whatever the outcome.
+        remedies: Code, cause and remedy by the name of a gate; None takes those of a
+            calibrated session.
     """
+    known = _REMEDIES if remedies is None else remedies
     ran = [gate for gate in gates if gate.verdict != "not run"]
     bad = [gate for gate in ran if gate.verdict == "bad"]
     worst = max(ran, key=lambda gate: gate.use)
@@ -262,11 +272,11 @@ def judge(gates: tuple[Gate, ...], sentence: str) -> Verdict:
         outcome = "CANNOT TELL" if any(gate.undecided for gate in bad) else "FAIL"
     findings = tuple(
         Finding(
-            _REMEDIES[gate.name][0],
-            _REMEDIES[gate.name][1],
+            known[gate.name][0],
+            known[gate.name][1],
             f"{gate.name}: {gate.found} (limit {gate.limit})",
             "error",
-            _REMEDIES[gate.name][2],
+            known[gate.name][2],
         )
         for gate in sorted(bad, key=lambda gate: -gate.use)
     )
