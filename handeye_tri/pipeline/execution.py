@@ -22,6 +22,7 @@ class Stage:
         after: Stages whose files it reads.
         run: Does the work; returns the names of the files and the quality line.
         header_keys: What else of session.json it depends on, beyond the seed.
+        preflight: Raises where the machine cannot do it; called before any work.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Stage:
     after: tuple[str, ...]
     run: Callable[[Run], tuple[list[str], str]]
     header_keys: tuple[str, ...] = ()
+    preflight: Callable[[], None] | None = None
 
 
 def inputs_of(run: Run, stage: Stage) -> str:
@@ -64,6 +66,11 @@ def execute(
         StorageError: an earlier stage's files are missing or damaged.
         HandEyeError: what the stage itself raises.
     """
+    for stage in stages.values():
+        if stage.verb in verbs and stage.preflight is not None:
+            state, _ = run.folder.state(stage.name, inputs_of(run, stage))
+            if state != "done" or again:
+                stage.preflight()
     for number, stage in enumerate(stages.values(), 1):
         if stage.verb not in verbs:
             continue

@@ -47,6 +47,12 @@ def _plan(run: Run) -> tuple[list[str], str]:
     )
 
 
+def _check_rendering() -> None:
+    from handeye_tri.simulate import check_rendering
+
+    check_rendering()
+
+
 def _simulate(run: Run) -> tuple[list[str], str]:
     from concurrent.futures import ThreadPoolExecutor
 
@@ -302,6 +308,7 @@ STAGES = {
             ("arm", "rig", "cameras", "surroundings", "imaging"),
             ("plan",),
             _simulate,
+            preflight=_check_rendering,
         ),
         Stage("detect", "detect", ("rig", "cameras"), ("simulate",), _detect),
         Stage("cameras", "calibrate", ("rig", "arm"), ("plan", "detect"), _cameras),

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 
-from handeye_tri.errors import HandEyeError, StorageError
+from handeye_tri.errors import HandEyeError, MissingDependencyError, StorageError
 from handeye_tri.pipeline import Run, Stage, execute, start
 from handeye_tri.storage import SessionFolder, write_json
 
@@ -101,6 +101,34 @@ def test_a_verb_needs_the_stages_before_it(tmp_path, fake):
         work(tmp_path / "s", fake, ["two"])
     assert fake.ran == []
     assert not (tmp_path / "s").exists()
+
+
+def test_what_the_machine_cannot_do_is_said_before_any_work(tmp_path, fake):
+    def absent():
+        raise MissingDependencyError("no OpenGL")
+
+    fake.stages["second"] = Stage(
+        "second", "two", (), ("first",), fake.second, preflight=absent
+    )
+    with pytest.raises(MissingDependencyError, match="no OpenGL"):
+        work(tmp_path / "s", fake)
+    assert fake.ran == []
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_finished_stage_needs_no_preflight(tmp_path, fake):
+    calls = []
+    fake.stages["second"] = Stage(
+        "second",
+        "two",
+        (),
+        ("first",),
+        fake.second,
+        preflight=lambda: calls.append("asked"),
+    )
+    work(tmp_path / "s", fake)
+    work(tmp_path / "s", fake)
+    assert calls == ["asked"]
 
 
 def test_a_failing_stage_leaves_the_ones_before_it_done(tmp_path, fake):
