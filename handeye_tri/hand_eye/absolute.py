@@ -22,6 +22,7 @@ ABSOLUTE_METHODS: tuple[AbsoluteMethod, ...] = get_args(AbsoluteMethod)
 _CHUNK = 4096
 # Rounds of estimating the two noise levels from the residuals; they settle in 3-4.
 _ROUNDS = 8
+_EYE = np.eye(3)
 
 
 def solve_axzb(
@@ -125,24 +126,27 @@ def _shah(a: Floats, b: Floats) -> tuple[SE3, SE3]:
     motions, so no pair's information is lost although the cost is linear.
     """
     n = len(a)
-    ra, rb = (np.ascontiguousarray(m[:, :3, :3]) for m in (a, b))
-    kronecker = (ra.reshape(n, 9).T @ rb.reshape(n, 9)).reshape(3, 3, 3, 3)
+    ra = np.ascontiguousarray(a[:, :3, :3])
+    rows = ra.reshape(n, 9)
+    kronecker = (rows.T @ b[:, :3, :3].reshape(n, 9)).reshape(3, 3, 3, 3)
     total = kronecker.transpose(0, 2, 1, 3).reshape(9, 9) / n
     u, values, vt = np.linalg.svd(total)
     require_determined(values[0], values[1], ra[:-1], ra[1:])
-    entries = vt[0].reshape(3, 3)
-    sign = np.sign(np.linalg.det(entries))
-    x = nearest_rotation(sign * entries)
-    z = nearest_rotation(sign * u[:, 0].reshape(3, 3))
+    both = np.array([vt[0], u[:, 0]]).reshape(2, 3, 3)
+    # Procrustes of matrices with positive determinants needs no mirror taken out.
+    left, _, right = np.linalg.svd(np.sign(np.linalg.det(both))[:, None, None] * both)
+    both = left @ right
     # R_A t_X - t_Z = R_Z t_B - t_A =: r. Its normal equations need means alone, since
     # R_A'R_A = I: t_Z = M t_X - mean r, (I - M'M) t_X = mean R_A'r - M' mean r.
-    right = b[:, :3, 3] @ z.T - a[:, :3, 3]
-    mean_ra, mean_right = ra.mean(axis=0), right.mean(axis=0)
-    turned = ra.reshape(3 * n, 3).T @ right.reshape(3 * n) / n
-    t_x = np.linalg.solve(
-        np.eye(3) - mean_ra.T @ mean_ra, turned - mean_ra.T @ mean_right
-    )
-    return SE3.from_parts(x, t_x), SE3.from_parts(z, mean_ra @ t_x - mean_right)
+    rest = b[:, :3, 3] @ both[1].T - a[:, :3, 3]
+    mean_ra, mean_rest = (rows.sum(axis=0) / n).reshape(3, 3), rest.sum(axis=0) / n
+    turned = ra.reshape(3 * n, 3).T @ rest.reshape(3 * n) / n
+    t_x = np.linalg.solve(_EYE - mean_ra.T @ mean_ra, turned - mean_ra.T @ mean_rest)
+    result = np.zeros((2, 4, 4))
+    result[:, :3, :3] = both
+    result[0, :3, 3], result[1, :3, 3] = t_x, mean_ra @ t_x - mean_rest
+    result[:, 3, 3] = 1.0
+    return SE3(result[0]), SE3(result[1])
 
 
 def _li(a: Floats, b: Floats) -> tuple[SE3, SE3]:

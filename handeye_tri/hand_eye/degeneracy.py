@@ -16,6 +16,8 @@ best one, the data do not decide.
 
 from __future__ import annotations
 
+from math import sqrt
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,7 +31,7 @@ Floats = NDArray[np.float64]
 # half-turns about coplanar axes and turns about parallel ones have a next best one
 # at 0.2 degrees and ratios of at most 2; general turns by 5 degrees have ratios of at
 # least 15, half-turns about axes that span space of at least 180.
-_MIN_ANGLE = np.radians(0.5)
+_MIN_ANGLE = float(np.radians(0.5))
 _MIN_RATIO = 4.0
 # Two half-turns can fit by chance so well that the ratio says nothing: motions that
 # are all half-turns within the first angle must have axes out of plane by the second.
@@ -48,7 +50,7 @@ def residual_angle(agreement: float) -> float:
     with agreement g; a rotation has norm sqrt(3) and ``|exp(w) - I|^2 = 2 |w|^2``
     for small w, so the RMS angle is sqrt(3 (1 - g)).
     """
-    return float(np.sqrt(3.0 * max(1.0 - agreement, 0.0)))
+    return sqrt(3.0 * max(1.0 - agreement, 0.0))
 
 
 def require_determined(
@@ -69,7 +71,7 @@ def require_determined(
     reached, other = residual_angle(best), residual_angle(next_best)
     distinct = other > max(_MIN_ANGLE, _MIN_RATIO * reached)
     # Cheaper than angles: the trace of a rotation is 1 + 2 cos(angle).
-    trace = np.einsum("nab,nab->n", *np.broadcast_arrays(first, second))
+    trace = np.einsum("nab,nab->n", first, second)
     if distinct and ((trace > _HALF_TURN_TRACE) & (trace < _NO_TURN_TRACE)).any():
         return
     vectors = so3_log(second @ np.swapaxes(first, 1, 2))

@@ -14,6 +14,10 @@ Floats = NDArray[np.float64]
 
 # A matrix whose R'R is farther than this from the identity is no rotation.
 _ROTATION_TOLERANCE = 1e-6
+# Poses checked at once: a few caches full.
+_CHUNK = 4096
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def check_motions(name: str, motions: ArrayLike, least: int) -> Floats:
@@ -36,13 +40,14 @@ def check_motions(name: str, motions: ArrayLike, least: int) -> Floats:
         raise InputError(f"{name} must have shape (n, 4, 4), got {m.shape}")
     if len(m) < least:
         raise InputError(f"{name} holds {len(m)} motions; at least {least} are needed")
-    if not np.isfinite(m).all():
+    # A sum is finite only if all its terms are.
+    if not np.isfinite(m.sum()) and not np.isfinite(m).all():
         bad = ~np.isfinite(m).all(axis=(1, 2))
         raise InputError(
             f"{name}[{np.argmax(bad)}] holds NaN or infinity "
             f"({bad.sum()} of {len(m)} do); drop those pairs first"
         )
-    last = np.abs(m[:, 3] - (0, 0, 0, 1))
+    last = np.abs(m[:, 3] - _LAST_ROW)
     if last.max() > 1e-9:
         i = int(np.argmax(last.max(axis=1)))
         raise InputError(
@@ -66,24 +71,12 @@ def _rotation_defect(motions: Floats) -> tuple[Floats, Floats]:
     By columns as arrays of length n: a batched 3x3 product and determinant cost more
     than the whole closed form.
     """
-    x, y, z = np.ascontiguousarray(motions[:, :3, :3].transpose(2, 1, 0))
-    pairs = (
-        (x, x, 1.0),
-        (y, y, 1.0),
-        (z, z, 1.0),
-        (x, y, 0.0),
-        (y, z, 0.0),
-        (z, x, 0.0),
-    )
-    defect = np.max(
-        [np.abs(np.einsum("in,in->n", u, v) - unit) for u, v, unit in pairs], axis=0
-    )
-    determinant = (
-        x[0] * (y[1] * z[2] - y[2] * z[1])
-        + x[1] * (y[2] * z[0] - y[0] * z[2])
-        + x[2] * (y[0] * z[1] - y[1] * z[0])
-    )
-    return defect, determinant
+    columns = np.ascontiguousarray(motions[:, :3, :3].transpose(2, 1, 0))
+    product = np.einsum("ain,bin->abn", columns, columns)
+    product[(0, 1, 2), (0, 1, 2)] -= 1.0
+    x, y, z = columns
+    cross = y[[1, 2, 0]] * z[[2, 0, 1]] - y[[2, 0, 1]] * z[[1, 2, 0]]
+    return np.abs(product).reshape(9, -1).max(axis=0), (x * cross).sum(axis=0)
 
 
 def check_pairs(a: ArrayLike, b: ArrayLike, least: int) -> tuple[Floats, Floats]:
@@ -97,6 +90,15 @@ def check_pairs(a: ArrayLike, b: ArrayLike, least: int) -> tuple[Floats, Floats]
     Raises:
         InputError: a list is unusable, or their lengths differ.
     """
+    first, second = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    if first.shape == second.shape and first.shape[1:] == (4, 4):
+        # Both at once, and only whether all is well: what is wrong is asked below.
+        n = len(first)
+        if n >= least and all(
+            _all_rigid(np.concatenate([first[i : i + _CHUNK], second[i : i + _CHUNK]]))
+            for i in range(0, n, _CHUNK)
+        ):
+            return first, second
     first, second = check_motions("a", a, least), check_motions("b", b, least)
     if len(first) != len(second):
         raise InputError(
@@ -104,6 +106,23 @@ def check_pairs(a: ArrayLike, b: ArrayLike, least: int) -> tuple[Floats, Floats]
             "a[i] and b[i] must belong together"
         )
     return first, second
+
+
+def _all_rigid(motions: Floats) -> bool:
+    """Whether the third column is the others' cross product, and they are unit."""
+    if not (motions[:, 3] == _LAST_ROW).all():
+        return False
+    columns = np.ascontiguousarray(motions[:, :3, :3].transpose(2, 1, 0))
+    x, y, z = columns
+    off = x[_NEXT] * y[_LAST] - x[_LAST] * y[_NEXT] - z
+    unit = np.einsum("ain,ain->an", columns[:2], columns[:2]) - 1.0
+    right = np.einsum("in,in->n", x, y)
+    # Comparisons are False for NaN; the translations are asked for it.
+    return bool(
+        max(np.abs(off).max(), np.abs(unit).max(), np.abs(right).max())
+        <= _ROTATION_TOLERANCE / 2
+        and np.isfinite(motions[:, :3, 3].sum())
+    )
 
 
 def relative_motions(
