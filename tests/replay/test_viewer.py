@@ -1,6 +1,7 @@
 """The headless viewer draws the recording without an error, and always ends."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -137,8 +138,11 @@ def test_a_port_in_use_is_refused(recording):
 def test_the_served_page_answers_on_loopback_only(recording):
     """The true program: a browser gets the page, and it is not on other addresses."""
     port = viewer._free_port()
+    # A shell's background jobs inherit an ignored SIGINT; this one must heed it.
     code = (
-        "import sys; from pathlib import Path; from handeye_tri.replay import serve\n"
+        "import signal, sys; from pathlib import Path\n"
+        "from handeye_tri.replay import serve\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "serve(Path(sys.argv[1]), int(sys.argv[2]))"
     )
     import time
@@ -171,5 +175,9 @@ def test_the_served_page_answers_on_loopback_only(recording):
             ]
             assert ours == [f"0100007F:{port:04X}"]
         finally:
-            process.send_signal(2)
-            process.wait(timeout=10)
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(timeout=20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                raise
