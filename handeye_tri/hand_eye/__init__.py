@@ -11,6 +11,12 @@ from handeye_tri.hand_eye.solve_pairs import (
     PairMethod,
     solve_pose_pairs,
 )
+from handeye_tri.hand_eye.target_views import (
+    TargetAdjustment,
+    TargetViews,
+    adjust_target_views,
+    target_views,
+)
 
 __all__ = [
     "ABSOLUTE_METHODS",
@@ -19,7 +25,10 @@ __all__ = [
     "PairMethod",
     "PoseSolution",
     "Reading",
+    "TargetAdjustment",
+    "TargetViews",
     "Undetermined",
+    "adjust_target_views",
     "calibrate_hand_eye",
     "free_scale_of",
     "relative_motions",
@@ -27,4 +36,5 @@ __all__ = [
     "solve_axzb",
     "solve_pose_pairs",
     "solve_readings",
+    "target_views",
 ]

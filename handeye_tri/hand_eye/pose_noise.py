@@ -91,12 +91,12 @@ def score_step(
     inverse: Floats,
     squares: Floats,
 ) -> Floats:
-    """One step of Fisher scoring, shape (5,).
+    """One step of Fisher scoring, shape (k,).
 
     Args:
-        log_variances: Where we are, shape (5,).
-        centre: Of the prior, shape (5,).
-        shapes: Shape (5, n, 6, 6), see :func:`noise_shapes`.
+        log_variances: Where we are, shape (k,).
+        centre: Of the prior, shape (k,).
+        shapes: Shape (k, n, 6, 6), see :func:`noise_shapes`.
         inverse: Of the residuals' covariance, shape (n, 6, 6).
         squares: Weighted outer products of the residuals plus the covariance that
             the fit took from them (what makes the likelihood restricted), (n, 6, 6).
@@ -109,7 +109,8 @@ def score_step(
     fisher = 0.5 * np.einsum("knij,lnij->kl", both, scaled)
     prior = 1 / _PRIOR_STD**2
     step = np.linalg.solve(
-        fisher + prior * np.eye(COMPONENTS), gradient - prior * (log_variances - centre)
+        fisher + prior * np.eye(len(shapes)),
+        gradient - prior * (log_variances - centre),
     )
     return np.asarray(step * min(1.0, _LARGEST_STEP / max(np.abs(step).max(), 1e-300)))
 
