@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.camera import INTRINSIC_NAMES, PinholeCamera
+from handeye_tri.camera import INTRINSIC_NAMES
 from handeye_tri.records import GroundTruth, HandEyeCalibration, motion_labels
 from handeye_tri.se3 import SE3, so3_left_jacobian_inverse, so3_log
 
@@ -145,9 +145,9 @@ def result_rows(
             owner, quantity = label.rsplit(".", 1)
             if owner != camera.name:
                 continue
-            value = _parameter(camera, quantity)
+            value = camera.parameter(quantity)
             unit = "px" if quantity in INTRINSIC_NAMES else ""
-            error = value - _parameter(true_camera, quantity) if true_camera else None
+            error = value - true_camera.parameter(quantity) if true_camera else None
             rows.append(_row(label, unit, value, covariance.std(label), error))
     motions = [
         (
@@ -177,16 +177,6 @@ def _row(
         "sigma": float(sigma),
         "error": None if error is None else float(error),
     }
-
-
-def _parameter(camera: PinholeCamera, quantity: str) -> float:
-    """A camera's parameter by name; a coefficient that its lens lacks is zero."""
-    if quantity in INTRINSIC_NAMES:
-        return float(getattr(camera.intrinsics, quantity))
-    names = camera.lens.names
-    if quantity not in names:
-        return 0.0
-    return float(camera.lens.coefficients[names.index(quantity)])
 
 
 def motion_rows(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handeye_tri.camera.lens import Lens, distort_jacobians
+from handeye_tri.camera.lens import LENS_COEFFICIENTS, Lens, distort_jacobians
 from handeye_tri.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -141,6 +141,20 @@ class PinholeCamera:
         y = (p[..., 1] - k.cy) / k.fy
         x = (p[..., 0] - k.cx - k.skew * y) / k.fx
         return self.lens.undistort(np.stack([x, y], axis=-1))
+
+    def parameter(self, name: str) -> float:
+        """An intrinsic, px, or lens coefficient by name; 0 where the lens lacks it.
+
+        Raises:
+            InputError: no lens has a coefficient of this name.
+        """
+        if name in INTRINSIC_NAMES:
+            return float(getattr(self.intrinsics, name))
+        if name in self.lens.names:
+            return float(self.lens.coefficients[self.lens.names.index(name)])
+        if not any(name in names for names in LENS_COEFFICIENTS.values()):
+            raise InputError(f"a camera has no parameter {name!r}")
+        return 0.0
 
     def project_jacobians(
         self, points: ArrayLike

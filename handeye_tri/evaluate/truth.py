@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from handeye_tri.camera import INTRINSIC_NAMES, PinholeCamera
 from handeye_tri.errors import InputError
 from handeye_tri.records import (
     MARKER_LABELS,
@@ -83,8 +82,8 @@ def compare_with_truth(
         owner, quantity = label.rsplit(".", 1)
         if owner in names:
             i = names.index(owner)
-            estimate = _camera_value(calibration.cameras[i], quantity)
-            value = _camera_value(truth.cameras[i], quantity)
+            estimate = calibration.cameras[i].parameter(quantity)
+            value = truth.cameras[i].parameter(quantity)
             error = estimate - value
         elif label in markers:
             estimate, value = markers[label]
@@ -140,15 +139,6 @@ def _components(motion: SE3, near: SE3) -> list[float]:
     if np.linalg.norm(vector - other) > np.pi:
         vector = vector * (1.0 - 2.0 * np.pi / np.linalg.norm(vector))
     return [*motion.translation.tolist(), *vector.tolist()]
-
-
-def _camera_value(camera: PinholeCamera, quantity: str) -> float:
-    """A camera's parameter by name; a coefficient that its lens lacks is zero."""
-    if quantity in INTRINSIC_NAMES:
-        return float(getattr(camera.intrinsics, quantity))
-    if quantity in camera.lens.names:
-        return float(camera.lens.coefficients[camera.lens.names.index(quantity)])
-    return 0.0
 
 
 def _baseline(

@@ -147,3 +147,17 @@ def test_vector_refused() -> None:
 def test_image_size_refused(size: tuple[int, ...]) -> None:
     with pytest.raises(InputError, match=r"camera 'left': image_size must be"):
         PinholeCamera("left", K, size)  # type: ignore[arg-type]
+
+
+def test_parameters_by_name():
+    camera = PinholeCamera(
+        "left",
+        Intrinsics(1720.0, 1715.0, 0.5, 519.0, 377.0),
+        (1024, 768),
+        Lens("radtan", np.array([0.1, 0.2, 0.3, 0.4, 0.5])),
+    )
+    assert camera.parameter("skew") == 0.5
+    assert camera.parameter("p2") == 0.4
+    assert camera.parameter("k6") == 0.0
+    with pytest.raises(InputError, match="no parameter 'k9'"):
+        camera.parameter("k9")
