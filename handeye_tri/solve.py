@@ -185,6 +185,8 @@ def _noise_lines(solution: PoseSolution) -> list[str]:
         if solution.tail is None or np.isinf(solution.tail)
         else f"; heavy tails (Student, {solution.tail:g} degrees of freedom)"
     )
+    if solution.correlation > 0:
+        tail += f"; successive errors correlate by {solution.correlation:.2f}"
     return [
         f"NOISE     one sd, {origin}{tail}",
         f"  robot {1e3 * noise.robot_translation:.3g} mm, "

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from handeye_tri.hand_eye.consensus import find_consensus, scene_length
 from handeye_tri.hand_eye.few_axes import start_from_few_axes, turns_are_few
-from handeye_tri.hand_eye.pose_fit import PoseInput, fit_poses
+from handeye_tri.hand_eye.pose_fit import fit_poses
+from handeye_tri.hand_eye.pose_model import PoseInput
 from handeye_tri.hand_eye.pose_solution import PoseSolution, residuals_of
 from handeye_tri.records import PosePairs
 from handeye_tri.se3 import SE3, se3_inverse

@@ -64,6 +64,7 @@ class PoseSolution:
         noise_is_stated: Which of the two.
         tail: Degrees of freedom of the residuals' Student distribution, infinite for
             the normal one; None where the method is a closed form.
+        correlation: Of successive poses' errors; 0 for independent ones.
         chi2: Sum of squared whitened residuals; None for a closed form.
         dof: Its degrees of freedom.
         undetermined: What the poses leave open.
@@ -87,6 +88,7 @@ class PoseSolution:
     noise: PoseNoise | None
     noise_is_stated: bool
     tail: float | None
+    correlation: float
     chi2: float | None
     dof: int
     undetermined: tuple[Undetermined, ...]

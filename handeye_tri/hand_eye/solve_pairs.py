@@ -14,7 +14,8 @@ from handeye_tri.hand_eye.clock import RobotTrack, correlate_clocks
 from handeye_tri.hand_eye.consensus import find_consensus
 from handeye_tri.hand_eye.few_axes import NO_TURN, start_from_few_axes, turns_are_few
 from handeye_tri.hand_eye.motions import check_motions, relative_motions
-from handeye_tri.hand_eye.pose_fit import PoseFit, PoseInput, fit_poses
+from handeye_tri.hand_eye.pose_fit import fit_poses
+from handeye_tri.hand_eye.pose_model import PoseFit, PoseInput
 from handeye_tri.hand_eye.pose_noise import noise_shapes
 from handeye_tri.hand_eye.pose_solution import PoseSolution, Undetermined
 from handeye_tri.hand_eye.relative import RelativeMethod, solve_axxb
@@ -127,6 +128,7 @@ def solve_pose_pairs(
         noise=fit.noise,
         noise_is_stated=pairs.noise is not None,
         tail=fit.tail,
+        correlation=fit.correlation,
         chi2=fit.chi2,
         dof=fit.dof,
         undetermined=undetermined,
@@ -365,6 +367,7 @@ def _closed_form(
         noise=None,
         noise_is_stated=False,
         tail=None,
+        correlation=0.0,
         chi2=None,
         dof=6 * n - 12,
         undetermined=(),

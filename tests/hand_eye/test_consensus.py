@@ -7,7 +7,7 @@ from pose_scene import random_poses, scene
 from handeye_tri.errors import DegenerateMotionError
 from handeye_tri.hand_eye import solve_axzb
 from handeye_tri.hand_eye.consensus import find_consensus, solve_samples
-from handeye_tri.hand_eye.pose_fit import PoseInput
+from handeye_tri.hand_eye.pose_model import PoseInput
 from handeye_tri.se3 import se3_inverse
 
 
