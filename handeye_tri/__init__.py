@@ -18,11 +18,17 @@ if TYPE_CHECKING:
     from handeye_tri.camera import Intrinsics, Lens, PinholeCamera, StereoRig
     from handeye_tri.errors import HandEyeError
     from handeye_tri.evaluate import evaluate_track
-    from handeye_tri.hand_eye import calibrate_hand_eye, solve_axxb, solve_axzb
+    from handeye_tri.hand_eye import (
+        calibrate_hand_eye,
+        solve_axxb,
+        solve_axzb,
+        solve_pose_pairs,
+    )
     from handeye_tri.records import (
         CameraCalibration,
         Covariance,
         HandEyeCalibration,
+        PosePairs,
         Session,
         TrackEvaluation,
     )
@@ -37,6 +43,7 @@ _HOMES = {
     "Intrinsics": "camera",
     "Lens": "camera",
     "PinholeCamera": "camera",
+    "PosePairs": "records",
     "SE3": "se3",
     "Session": "records",
     "StereoRig": "camera",
@@ -49,6 +56,7 @@ _HOMES = {
     "evaluate_track": "evaluate",
     "solve_axxb": "hand_eye",
     "solve_axzb": "hand_eye",
+    "solve_pose_pairs": "hand_eye",
 }
 
 __all__ = [
@@ -60,6 +68,7 @@ __all__ = [
     "Intrinsics",
     "Lens",
     "PinholeCamera",
+    "PosePairs",
     "Session",
     "StereoRig",
     "TrackEvaluation",
@@ -71,6 +80,7 @@ __all__ = [
     "evaluate_track",
     "solve_axxb",
     "solve_axzb",
+    "solve_pose_pairs",
 ]
 
 

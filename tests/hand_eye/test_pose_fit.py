@@ -108,7 +108,7 @@ def test_more_accurate_than_shah_and_covariance_honest_with_stated_noise(mountin
 
 def test_noise_from_residuals_costs_little_and_stays_honest():
     nees, squares = [], np.zeros(2)
-    for seed in range(40):
+    for seed in range(25):
         robot, observed, x, z = scene(seed, 30)
         found = fit(robot, observed, "eye_in_hand")
         known = fit(robot, observed, "eye_in_hand", noise=NOISE)
@@ -133,7 +133,7 @@ def test_many_poses_tell_the_noise_apart():
 
 def test_heavy_tails_are_noticed_and_pay():
     squares, tails = np.zeros(2), []
-    for seed in range(30):
+    for seed in range(15):
         robot, observed, x, z = scene(seed, 40, tail=2.5)
         found = fit(robot, observed, "eye_in_hand")
         plain = fit(robot, observed, "eye_in_hand", noise=NOISE)
@@ -214,7 +214,7 @@ def drifting(seed, n=200, scale=0.5):
 
 def test_errors_that_add_up_are_noticed_and_the_covariance_holds():
     errors, squares, correlations = [], np.zeros(2), []
-    for seed in range(16):
+    for seed in range(10):
         robot, observed, x, z = drifting(seed)
         data = PoseInput(robot, observed, True, free_scale=True)
         found = fit_poses(data, x, z, scale=2.0)
