@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from handeye_tri.adjustment import adjust
     from handeye_tri.calibrate_cameras import (
         calibrate_camera,
         calibrate_cameras_general,
@@ -49,6 +50,7 @@ _HOMES = {
     "StereoRig": "camera",
     "TrackEvaluation": "records",
     "TriangleRig": "triangle",
+    "adjust": "adjustment",
     "calibrate_camera": "calibrate_cameras",
     "calibrate_cameras_general": "calibrate_cameras",
     "calibrate_hand_eye": "hand_eye",
@@ -73,6 +75,7 @@ __all__ = [
     "StereoRig",
     "TrackEvaluation",
     "TriangleRig",
+    "adjust",
     "calibrate_camera",
     "calibrate_cameras_general",
     "calibrate_hand_eye",

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from handeye_tri import storage
-from handeye_tri.adjust import adjust, joint_offsets, link_corrections
+from handeye_tri.adjustment import adjust, joint_offsets, link_corrections
 from handeye_tri.arm import Arm
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
 from handeye_tri.camera import Intrinsics, PinholeCamera

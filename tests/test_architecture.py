@@ -28,7 +28,7 @@ ROWS: tuple[tuple[str, ...], ...] = (
     ("plan", "synthesize", "simulate", "detect"),
     ("calibrate_cameras",),
     ("hand_eye",),
-    ("adjust",),
+    ("adjustment",),
     ("evaluate", "diagnose"),
     # The words on the terminal, in the report and in the recording are the same.
     ("summary",),
@@ -55,7 +55,7 @@ ENGINES = {
     "rerun": ("replay",),
     "rerun_bindings": ("replay",),
 }
-ESTIMATORS = ("calibrate_cameras", "hand_eye", "adjust")
+ESTIMATORS = ("calibrate_cameras", "hand_eye", "adjustment")
 # Rank alone would let an estimator read these.
 CLOSED_TO_ESTIMATORS = {
     *("arm", "kinematics", "mechanism", "plan", "simulate", "synthesize", "detect"),
@@ -155,7 +155,7 @@ def violations(module: str, text: str) -> list[str]:
         ("se3", "from handeye_tri.camera import PinholeCamera"),
         ("camera", "from handeye_tri.triangle import AXES"),
         ("camera", "def f():\n    import handeye_tri.records"),
-        ("hand_eye", "from handeye_tri import adjust"),
+        ("hand_eye", "from handeye_tri import adjustment"),
         ("hand_eye", "from handeye_tri.config import Cell"),
         ("hand_eye", "from handeye_tri import SE3"),
         ("plan", "def f():\n    import pinocchio as pin"),

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from handeye_tri.adjust import adjust, joint_offsets
+from handeye_tri.adjustment import adjust, joint_offsets
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
 from handeye_tri.camera import Intrinsics, PinholeCamera, triangulate
 from handeye_tri.errors import InputError

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.adjust import RobotParameters
+from handeye_tri.adjustment import RobotParameters
 from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
 from handeye_tri.camera import triangulate
 from handeye_tri.errors import InputError

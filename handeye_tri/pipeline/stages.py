@@ -152,7 +152,7 @@ def _cameras(run: Run) -> tuple[list[str], str]:
 
 
 def _hand_eye(run: Run) -> tuple[list[str], str]:
-    from handeye_tri.adjust import adjust
+    from handeye_tri.adjustment import adjust
     from handeye_tri.hand_eye import calibrate_hand_eye
 
     session = run.session()

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from handeye_tri.adjust.model import AdjustmentModel, Linearisation
-from handeye_tri.adjust.problem import Sides, State, Stations
-from handeye_tri.adjust.result import adjustment_result, check_determined
-from handeye_tri.adjust.robot import RobotParameters, determined
-from handeye_tri.adjust.robust import Loss
+from handeye_tri.adjustment.model import AdjustmentModel, Linearisation
+from handeye_tri.adjustment.problem import Sides, State, Stations
+from handeye_tri.adjustment.result import adjustment_result, check_determined
+from handeye_tri.adjustment.robot import RobotParameters, determined
+from handeye_tri.adjustment.robust import Loss
 from handeye_tri.calibrate_cameras.bundle_input import observations, pairs, unknowns
 from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
 from handeye_tri.calibrate_cameras.least_squares import Minimum, minimise

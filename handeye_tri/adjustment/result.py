@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.adjust.model import AdjustmentModel, Linearisation
-from handeye_tri.adjust.problem import State
-from handeye_tri.adjust.robust import apply_loss
+from handeye_tri.adjustment.model import AdjustmentModel, Linearisation
+from handeye_tri.adjustment.problem import State
+from handeye_tri.adjustment.robust import apply_loss
 from handeye_tri.calibrate_cameras.least_squares import Minimum
 from handeye_tri.camera import INTRINSIC_NAMES, Intrinsics, Lens, PinholeCamera
 from handeye_tri.errors import DegenerateMotionError
@@ -88,7 +88,7 @@ def adjustment_result(
     undetermined: tuple[str, ...],
     correlation: float,
 ) -> HandEyeCalibration:
-    """Put a minimum into the record, see :func:`handeye_tri.adjust.adjust`."""
+    """Put a minimum into the record, see :func:`handeye_tri.adjust`."""
     state, model = end.state, end.blocks.model
     information, condition = check_determined(end, start.cameras)
     scale = 1.0 / np.sqrt(np.diagonal(information))

@@ -7,7 +7,7 @@ import adjust_scene
 import numpy as np
 import pytest
 
-from handeye_tri.adjust import Loss, adjust
+from handeye_tri.adjustment import Loss, adjust
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.evaluate import evaluate_track

@@ -7,14 +7,14 @@ import adjust_scene
 import numpy as np
 import pytest
 
-from handeye_tri.adjust import (
+from handeye_tri.adjustment import (
     RobotParameters,
     adjust,
     clock_offset,
     joint_offsets,
     link_corrections,
 )
-from handeye_tri.adjust.robot import determined
+from handeye_tri.adjustment.robot import determined
 from handeye_tri.errors import InputError
 from handeye_tri.evaluate import evaluate_track
 from handeye_tri.se3 import SE3, se3_adjoint, se3_exp, se3_inverse, se3_log

@@ -16,16 +16,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.adjust.derivatives import (
+from handeye_tri.adjustment.derivatives import (
     bent_rays,
     by_unknowns,
     in_camera,
     marker_points,
 )
-from handeye_tri.adjust.equations import ChunkedEquations, chunks
-from handeye_tri.adjust.problem import Sides, State, Stations
-from handeye_tri.adjust.robot import RobotParameters, right_jacobian
-from handeye_tri.adjust.robust import Loss, apply_loss
+from handeye_tri.adjustment.equations import ChunkedEquations, chunks
+from handeye_tri.adjustment.problem import Sides, State, Stations
+from handeye_tri.adjustment.robot import RobotParameters, right_jacobian
+from handeye_tri.adjustment.robust import Loss, apply_loss
 from handeye_tri.camera import distort
 from handeye_tri.se3 import se3_adjoint, se3_exp, se3_inverse
 

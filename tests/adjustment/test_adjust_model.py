@@ -6,12 +6,12 @@ import adjust_scene
 import numpy as np
 import pytest
 
-from handeye_tri.adjust.equations import CHUNK, ChunkedEquations
-from handeye_tri.adjust.joint import _root, _side_lengths, _start, _stations
-from handeye_tri.adjust.model import AdjustmentModel
-from handeye_tri.adjust.problem import Sides
-from handeye_tri.adjust.robot import RobotParameters
-from handeye_tri.adjust.robust import Loss
+from handeye_tri.adjustment.equations import CHUNK, ChunkedEquations
+from handeye_tri.adjustment.joint import _root, _side_lengths, _start, _stations
+from handeye_tri.adjustment.model import AdjustmentModel
+from handeye_tri.adjustment.problem import Sides
+from handeye_tri.adjustment.robot import RobotParameters
+from handeye_tri.adjustment.robust import Loss
 from handeye_tri.calibrate_cameras.least_squares import NormalEquations, minimise
 
 
