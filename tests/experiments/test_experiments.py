@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from handeye_tri import cli
+from handeye_tri.cli.progress import TimeLeft
 from handeye_tri.errors import InputError
 from handeye_tri.experiments import NAMES, fig12, run_experiment, run_paper
 from handeye_tri.experiments.outcome import Options, finish, new_figure
@@ -160,7 +161,7 @@ def test_what_is_missing_is_said(capsys, tmp_path):
 
 
 def test_time_left_is_told_on_stderr(capsys):
-    tell = cli._TimeLeft()
+    tell = TimeLeft()
     tell(1, 9, 125.7)
     tell(2, 9, 100.0)
     tell(9, 9, 0.0)

@@ -1,0 +1,172 @@
+"""Verbs on a session: all its stages, or one of them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from handeye_tri.cli.group import AGAIN, EXIT_CODES, SESSION, commands, example
+from handeye_tri.cli.progress import StderrProgress, cap_threads
+
+if TYPE_CHECKING:
+    from handeye_tri.pipeline import Run
+    from handeye_tri.storage import SessionFolder
+
+
+def _work(folder: SessionFolder, verbs: tuple[str, ...], *, again: bool) -> Run:
+    from handeye_tri.pipeline import STAGES, Run, execute
+
+    cap_threads()
+    progress = StderrProgress()
+    run = Run(folder, progress)
+    try:
+        with folder.locked():
+            execute(run, STAGES, verbs, again=again)
+    finally:
+        progress.close()
+    return run
+
+
+def _conclude(run: Run, *, as_json: bool) -> None:
+    """Print the summary and leave with the verdict's exit code."""
+    import json
+
+    from handeye_tri.summary import summary_text
+
+    evaluation = run.evaluation()
+    if as_json:
+        click.echo(json.dumps(evaluation, indent=1, ensure_ascii=False))
+    else:
+        click.echo(summary_text(evaluation, run.folder.path, run.written()))
+    sys.exit(EXIT_CODES[evaluation["verdict"]])
+
+
+@commands.command(epilog=example("handeye-tri run hp3_stereo -o out --seed 1"))
+@click.argument("cell", default="hp3_stereo")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="The session's folder; made where it is absent.",
+)
+@click.option("--seed", default=1, show_default=True, help="Seed of all randomness.")
+@click.option(
+    "--half-turns",
+    type=click.IntRange(min=2),
+    help="How many half-turns to plan.  [default: as the cell says]",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print evaluation.json only.")
+def run(
+    cell: str, output: Path, seed: int, half_turns: int | None, as_json: bool
+) -> None:
+    """Plan, simulate, detect, calibrate, evaluate and report, on rendered images.
+
+    CELL is the path of a YAML file or a name in scenes/. What is already done in
+    the folder is not done again unless its inputs changed.
+    """
+    from handeye_tri.pipeline import VERBS, start
+
+    folder = start(cell, output, seed, half_turns)
+    click.echo(
+        f"handeye-tri {folder.header['software']['handeye-tri']}    "
+        f"cell {folder.cell.name}    seed {seed}    "
+        "SIMULATED (truth known, used only to score)",
+        err=True,
+    )
+    _conclude(_work(folder, VERBS, again=False), as_json=as_json)
+
+
+@commands.command(epilog=example("handeye-tri plan out --cell hp3_stereo --seed 1"))
+@SESSION
+@click.option("--cell", help="Start a new session for this cell.")
+@click.option("--seed", default=1, show_default=True, help="Seed of a new session.")
+@click.option(
+    "--half-turns", type=click.IntRange(min=2), help="Half-turns of a new session."
+)
+@AGAIN
+def plan(
+    session: Path, cell: str | None, seed: int, half_turns: int | None, again: bool
+) -> None:
+    """Plan the robot's stations: reachable, visible, free of collision."""
+    from handeye_tri.pipeline import start
+    from handeye_tri.storage import SessionFolder
+
+    folder = (
+        SessionFolder.open(session)
+        if cell is None
+        else start(cell, session, seed, half_turns)
+    )
+    _work(folder, ("plan",), again=again)
+
+
+def _verb(name: str, text: str) -> None:
+    """Add a verb that runs one stage of an existing session."""
+
+    @commands.command(name, help=text, epilog=example(f"handeye-tri {name} out"))
+    @SESSION
+    @AGAIN
+    def command(session: Path, again: bool) -> None:
+        from handeye_tri.storage import SessionFolder
+
+        finished = _work(SessionFolder.open(session), (name,), again=again)
+        if name == "evaluate":
+            _conclude(finished, as_json=False)
+
+
+_verb("simulate", "Execute the plan in the simulator and render every view.")
+_verb("detect", "Find the three markers in every image, with their covariance.")
+_verb("evaluate", "Compare the robot's and the cameras' track at held-out stations.")
+_verb("report", "Write the recording (replay.rrd) and report.html.")
+
+
+@commands.command(epilog=example("handeye-tri calibrate out --method separate"))
+@SESSION
+@click.option(
+    "--method",
+    type=click.Choice(["joint", "separate"]),
+    default="joint",
+    show_default=True,
+    help="Adjust cameras, markers and robot together, or step by step as the paper.",
+)
+@AGAIN
+def calibrate(session: Path, method: str, again: bool) -> None:
+    """Calibrate the cameras and where they and the markers are to the robot."""
+    from handeye_tri.storage import SessionFolder
+
+    folder = SessionFolder.open(session)
+    folder.header["method"] = method
+    _work(folder, ("calibrate",), again=again)
+
+
+@commands.command(epilog=example("handeye-tri replay out --screenshot out.png"))
+@SESSION
+@click.option("--serve", is_flag=True, help="Serve it to a browser, on loopback only.")
+@click.option(
+    "--screenshot",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write a picture of it instead; needs no display.",
+)
+@click.option("--station", type=int, help="Station to show in the picture.")
+def replay(
+    session: Path, serve: bool, screenshot: Path | None, station: int | None
+) -> None:
+    """Show a session's recording."""
+    from handeye_tri import replay as recording
+    from handeye_tri.storage import SessionFolder
+
+    folder = SessionFolder.open(session)
+    folder.require("report")
+    path = folder.file("replay.rrd")
+    if screenshot is not None:
+        problems = recording.screenshot(path, screenshot, station=station)
+        for problem in problems:
+            click.echo(f"view error: {problem}", err=True)
+        click.echo(f"wrote {screenshot}")
+    elif serve:
+        recording.serve(path)
+    else:
+        recording.open_viewer(path)
