@@ -68,8 +68,8 @@ def ours(sequence: Any) -> tuple[Any, Any]:
     return found.x.matrix, found.z.matrix
 
 
-def references() -> dict[str, Callable[[Any], tuple[Any, Any]]]:
-    """KinHEC's own solvers in its own protocol."""
+def references(slow: bool) -> dict[str, Callable[[Any], tuple[Any, Any]]]:
+    """KinHEC's own solvers in its own protocol, and some on all frames."""
     from kinhec.benchmark import SOLVERS, _keyframe_data
 
     def run(name: str) -> Callable[[Any], tuple[Any, Any]]:
@@ -92,9 +92,9 @@ def references() -> dict[str, Callable[[Any], tuple[Any, Any]]]:
 
         return solve
 
+    everywhere = ["shah", *(["shah+lm"] if slow else [])]
     return {f"kinhec {name}": run(name) for name in SOLVERS} | {
-        f"kinhec {name}, all frames": run_all(name)
-        for name in ("shah", "li_kronecker", "shah+lm")
+        f"kinhec {name}, all frames": run_all(name) for name in everywhere
     }
 
 
@@ -171,6 +171,7 @@ def evaluate(
     most: int,
     only: str | None,
     tracks: list[str] | None,
+    slow: bool,
 ) -> None:
     """Append one line per sequence and solver to DATA/check.jsonl."""
     from kinhec import iter_sequences, load_manifest
@@ -182,7 +183,7 @@ def evaluate(
         for line in log.read_text().splitlines():
             row = json.loads(line)
             done.add((row["sequence"], row["solver"]))
-    solvers = {"ours": ours, **references(), **opencv(most)}
+    solvers = {"ours": ours, **references(slow), **opencv(most)}
     if only:
         solvers = {name: solvers[name] for name in solvers if only in name}
     manifest = load_manifest(folder, tracks)
@@ -262,6 +263,9 @@ def main() -> None:
     parser.add_argument("--cv-poses", type=int, default=100, help="OpenCV's most poses")
     parser.add_argument("--only", help="solvers whose name contains this")
     parser.add_argument("--tracks", nargs="*", help="these tracks alone")
+    parser.add_argument(
+        "--slow", action="store_true", help="also shah+lm on all frames (10 s each)"
+    )
     arguments = parser.parse_args()
     if not (arguments.data / "sequences.parquet").exists():
         make(arguments.data, arguments.seed)
@@ -271,6 +275,7 @@ def main() -> None:
         arguments.cv_poses,
         arguments.only,
         arguments.tracks,
+        arguments.slow,
     )
     sys.exit(0 if table(arguments.data) else 1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import copysign
 from typing import Literal, get_args
 
 import numpy as np
@@ -126,27 +127,35 @@ def _shah(a: Floats, b: Floats) -> tuple[SE3, SE3]:
     motions, so no pair's information is lost although the cost is linear.
     """
     n = len(a)
-    ra = np.ascontiguousarray(a[:, :3, :3])
-    rows = ra.reshape(n, 9)
-    kronecker = (rows.T @ b[:, :3, :3].reshape(n, 9)).reshape(3, 3, 3, 3)
-    total = kronecker.transpose(0, 2, 1, 3).reshape(9, 9) / n
+    # Every sum over poses of an entry of A times one of B, ones included: all that is
+    # needed but the sum of R_A't_A.
+    sums = (a.reshape(n, 16).T @ b.reshape(n, 16) / n).reshape(4, 4, 4, 4)
+    total = sums[:3, :3, :3, :3].transpose(0, 2, 1, 3).reshape(9, 9)
     u, values, vt = np.linalg.svd(total)
+    ra = a[:, :3, :3]
     require_determined(values[0], values[1], ra[:-1], ra[1:])
-    both = np.array([vt[0], u[:, 0]]).reshape(2, 3, 3)
     # Procrustes of matrices with positive determinants needs no mirror taken out.
-    left, _, right = np.linalg.svd(np.sign(np.linalg.det(both))[:, None, None] * both)
+    entries = [copysign(1.0, _determinant(one)) * one for one in (vt[0], u[:, 0])]
+    left, _, right = np.linalg.svd(np.array(entries).reshape(2, 3, 3))
     both = left @ right
     # R_A t_X - t_Z = R_Z t_B - t_A =: r. Its normal equations need means alone, since
     # R_A'R_A = I: t_Z = M t_X - mean r, (I - M'M) t_X = mean R_A'r - M' mean r.
-    rest = b[:, :3, 3] @ both[1].T - a[:, :3, 3]
-    mean_ra, mean_rest = (rows.sum(axis=0) / n).reshape(3, 3), rest.sum(axis=0) / n
-    turned = ra.reshape(3 * n, 3).T @ rest.reshape(3 * n) / n
+    mean_ra = sums[:3, :3, 3, 3]
+    mean_rest = both[1] @ sums[3, 3, :3, 3] - sums[:3, 3, 3, 3]
+    turned = np.einsum("jik,jk->i", sums[:3, :3, :3, 3], both[1])
+    turned -= np.einsum("nji,nj->i", ra, a[:, :3, 3]) / n
     t_x = np.linalg.solve(_EYE - mean_ra.T @ mean_ra, turned - mean_ra.T @ mean_rest)
     result = np.zeros((2, 4, 4))
     result[:, :3, :3] = both
     result[0, :3, 3], result[1, :3, 3] = t_x, mean_ra @ t_x - mean_rest
     result[:, 3, 3] = 1.0
     return SE3(result[0]), SE3(result[1])
+
+
+def _determinant(entries: Floats) -> float:
+    """Of nine entries; plain floats, since numpy's takes ten times as long."""
+    a, b, c, d, e, f, g, h, i = entries.tolist()
+    return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
 
 def _li(a: Floats, b: Floats) -> tuple[SE3, SE3]:

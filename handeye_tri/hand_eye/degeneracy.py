@@ -39,8 +39,10 @@ _HALF_TURN = np.radians(179.0)
 _OUT_OF_PLANE = np.radians(2.0)
 # Axes that spread by this are not parallel: then the two sides contradict each other.
 _SPREAD = np.radians(20.0)
-_HALF_TURN_TRACE = 1.0 + 2.0 * np.cos(_HALF_TURN)
-_NO_TURN_TRACE = 1.0 + 2.0 * np.cos(np.radians(18.0))
+# The trace of a rotation is 1 + 2 cos(angle): turns from 18 degrees to almost a
+# half-turn have traces within the second number of the first.
+_GOOD_TRACE = float(1.0 + np.cos(np.radians(18.0)) + np.cos(_HALF_TURN))
+_GOOD_TRACES = float(np.cos(np.radians(18.0)) - np.cos(_HALF_TURN))
 
 
 def residual_angle(agreement: float) -> float:
@@ -70,9 +72,9 @@ def require_determined(
     """
     reached, other = residual_angle(best), residual_angle(next_best)
     distinct = other > max(_MIN_ANGLE, _MIN_RATIO * reached)
-    # Cheaper than angles: the trace of a rotation is 1 + 2 cos(angle).
+    # Cheaper than angles, and one such turn is enough.
     trace = np.einsum("nab,nab->n", first, second)
-    if distinct and ((trace > _HALF_TURN_TRACE) & (trace < _NO_TURN_TRACE)).any():
+    if distinct and np.abs(trace - _GOOD_TRACE).min() < _GOOD_TRACES:
         return
     vectors = so3_log(second @ np.swapaxes(first, 1, 2))
     angles = np.linalg.norm(vectors, axis=1)

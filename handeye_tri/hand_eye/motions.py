@@ -14,10 +14,43 @@ Floats = NDArray[np.float64]
 
 # A matrix whose R'R is farther than this from the identity is no rotation.
 _ROTATION_TOLERANCE = 1e-6
-# Poses checked at once: a few caches full.
-_CHUNK = 4096
-_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+# Poses checked at once: a cache full.
+_CHUNK = 1024
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def _rigid_conditions() -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
+    """Six numbers that vanish for a rotation with columns x, y, z, as sums of products.
+
+    They are x cross y - z, x'x - 1, y'y - 1 and x'y; the ones are the matrix' last
+    entry.
+
+    Returns:
+        Which of the 16 entries the first and the second factor of each product is,
+        and the products' signs, shape (products, 6).
+    """
+    one = 15
+    terms = []
+    for k in range(3):
+        after, last = (k + 1) % 3, (k + 2) % 3
+        terms += [
+            (4 * after, 4 * last + 1, k, 1.0),
+            (4 * last, 4 * after + 1, k, -1.0),
+            (4 * k + 2, one, k, -1.0),
+            (4 * k, 4 * k, 3, 1.0),
+            (4 * k + 1, 4 * k + 1, 4, 1.0),
+            (4 * k, 4 * k + 1, 5, 1.0),
+        ]
+    terms += [(one, one, 3, -1.0), (one, one, 4, -1.0)]
+    first, second, condition, sign = (
+        np.array(part) for part in zip(*terms, strict=True)
+    )
+    signs = np.zeros((len(terms), 6))
+    signs[np.arange(len(terms)), condition] = sign
+    return first, second, signs
+
+
+_FIRST, _SECOND, _CONDITIONS = _rigid_conditions()
 
 
 def check_motions(name: str, motions: ArrayLike, least: int) -> Floats:
@@ -110,19 +143,13 @@ def check_pairs(a: ArrayLike, b: ArrayLike, least: int) -> tuple[Floats, Floats]
 
 def _all_rigid(motions: Floats) -> bool:
     """Whether the third column is the others' cross product, and they are unit."""
-    if not (motions[:, 3] == _LAST_ROW).all():
+    entries = motions.reshape(-1, 16)
+    if not (entries[:, 12:] == _LAST_ROW).all():
         return False
-    columns = np.ascontiguousarray(motions[:, :3, :3].transpose(2, 1, 0))
-    x, y, z = columns
-    off = x[_NEXT] * y[_LAST] - x[_LAST] * y[_NEXT] - z
-    unit = np.einsum("ain,ain->an", columns[:2], columns[:2]) - 1.0
-    right = np.einsum("in,in->n", x, y)
+    products = entries.take(_FIRST, axis=1) * entries.take(_SECOND, axis=1)
+    off = np.abs(products @ _CONDITIONS).max()
     # Comparisons are False for NaN; the translations are asked for it.
-    return bool(
-        max(np.abs(off).max(), np.abs(unit).max(), np.abs(right).max())
-        <= _ROTATION_TOLERANCE / 2
-        and np.isfinite(motions[:, :3, 3].sum())
-    )
+    return bool(off <= _ROTATION_TOLERANCE / 2 and np.isfinite(entries.sum()))
 
 
 def relative_motions(
