@@ -1,6 +1,13 @@
 """How good a calibrated cell is: held-out track, budget, map, truth where known."""
 
 from handeye_tri.evaluate.budget import TrackBudget
+from handeye_tri.evaluate.cross_validation import CrossValidation, cross_validate
+from handeye_tri.evaluate.repeatability import (
+    Spread,
+    bootstrap,
+    parametric_bootstrap,
+    track_part,
+)
 from handeye_tri.evaluate.track import (
     LoopResiduals,
     evaluate_track,
@@ -16,13 +23,19 @@ from handeye_tri.evaluate.workspace import (
 
 __all__ = [
     "Comparison",
+    "CrossValidation",
     "LoopResiduals",
+    "Spread",
     "TrackBudget",
     "TrackMap",
+    "bootstrap",
     "compare_with_truth",
+    "cross_validate",
     "evaluate_track",
     "loop_residuals",
+    "parametric_bootstrap",
     "predicted_track_error",
     "track_budget",
     "track_map",
+    "track_part",
 ]
