@@ -34,7 +34,7 @@ _MAX_TURN_RESIDUAL = 0.05
 _CHANCE = 1e-3
 # A focal length whose sigma is a larger part of it than this is not determined: four
 # sigmas reach zero and infinity, and sigma itself means nothing.
-_MAX_RELATIVE_SIGMA = 0.25
+MAX_RELATIVE_SIGMA = 0.25
 # One whose sigma is larger than this is weak, and said to be.
 _WEAK_RELATIVE_SIGMA = 0.02
 # Sides over the image's longer side, tilt, spread and number below which each is named
@@ -44,7 +44,7 @@ _LOW_TILT_DEG = 15.0
 _LOW_SPREAD_DEG = 20.0
 _FEW = 6
 # Scaled information worse conditioned than this is singular in double precision.
-_MAX_CONDITION = 1e13
+MAX_CONDITION = 1e13
 # Noise that is assumed at least where the residuals are at rounding, pixels.
 _LEAST_NOISE_PX = 1e-3
 
@@ -109,28 +109,52 @@ def _side_px(data: HalfTurnData) -> Floats:
     return np.asarray(sides.mean(axis=1))
 
 
-def is_turn(data: HalfTurnData, homographies: Homographies) -> NDArray[np.bool_]:
-    """Which half-turns fit a plane to within a twentieth of the triangle's side."""
-    return np.asarray(homographies.residual_px <= _MAX_TURN_RESIDUAL * _side_px(data))
+def is_turn(
+    data: HalfTurnData, residual_px: Floats, *, lens_ahead: bool = False
+) -> NDArray[np.bool_]:
+    """Which half-turns fit to within a twentieth of the triangle's side.
+
+    Args:
+        data: The half-turns.
+        residual_px: Root mean square residual of each, shape (n,), pixels.
+        lens_ahead: The residuals are of planes seen without the lens that is yet to
+            be estimated. It bends a half-turn by a part of how far its two images
+            reach, however small the triangle: a twentieth of that is allowed.
+    """
+    size = _reach_px(data) if lens_ahead else _side_px(data)
+    return np.asarray(residual_px <= _MAX_TURN_RESIDUAL * size)
 
 
-def check_turns(data: HalfTurnData, homographies: Homographies) -> None:
+def _reach_px(data: HalfTurnData) -> Floats:
+    """Largest distance of two of the six points of each half-turn, (n,), pixels."""
+    points = data.pixels.reshape(-1, 6, 2)
+    apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
+    return np.asarray(apart.max(axis=(1, 2)))
+
+
+def check_turns(
+    data: HalfTurnData, residual_px: Floats, *, lens_ahead: bool = False
+) -> None:
     """Refuse images that are no half-turn about the stated axis, whatever K is.
 
     One plane must map to both images of a half-turn. An inexact robot misses that by
     pixels; a wrong axis, triangle or marker order by a good part of the triangle.
 
+    Args:
+        data: The half-turns.
+        residual_px: Root mean square residual of each, shape (n,), pixels.
+        lens_ahead: As for :func:`is_turn`.
+
     Raises:
         DegenerateMotionError: names the worst half-turn and its residual.
     """
-    if is_turn(data, homographies).all():
+    if is_turn(data, residual_px, lens_ahead=lens_ahead).all():
         return
     side = _side_px(data)
-    worst = int(np.argmax(homographies.residual_px / side))
-    residual = float(homographies.residual_px[worst])
+    worst = int(np.argmax(residual_px / side))
     raise DegenerateMotionError(
         f"half-turn {data.index[worst]} is no half-turn about {data.axes[worst]!r}: no "
-        f"plane fits its two images, RMS residual {residual:.2f} px for a "
+        f"plane fits its two images, RMS residual {residual_px[worst]:.2f} px for a "
         f"triangle of {side[worst]:.0f} px; check the axis, the triangle, the order of "
         "A, B, C and which images belong together"
     )
@@ -245,9 +269,9 @@ def check_determined(
         DegenerateMotionError: says sigma, spread, condition and the triangle's size.
     """
     relative = float((sigma / focal).max()) if np.isfinite(sigma).all() else np.inf
-    if condition <= _MAX_CONDITION and relative <= _MAX_RELATIVE_SIGMA:
+    if condition <= MAX_CONDITION and relative <= MAX_RELATIVE_SIGMA:
         return
-    if coefficients > 2 and (relative <= _MAX_RELATIVE_SIGMA or np.isinf(relative)):
+    if coefficients > 2 and (relative <= MAX_RELATIVE_SIGMA or np.isinf(relative)):
         raise DegenerateMotionError(
             f"the half-turns do not tell {coefficients} lens coefficients apart "
             f"(condition {condition:.2g}, of fx alone a predicted sigma of "

@@ -97,11 +97,13 @@ def find_consensus(
         DegenerateMotionError: fewer than three quarters agree on anything.
     """
     n = len(data)
+    bends = bool(build(data, np.arange(n)).lens)
     found = [own_homography(data.take([i]), o) for i in range(n)]
     fits = {
         i: one
         for i, one in enumerate(found)
-        if one is not None and bool(is_turn(data.take([i]), one)[0])
+        if one is not None
+        and is_turn(data.take([i]), one.residual_px, lens_ahead=bends).all()
     }
     sound, each = np.array(list(fits), dtype=np.intp), list(fits.values())
     least = int(np.ceil(_MAJORITY * n))

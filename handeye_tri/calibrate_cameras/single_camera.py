@@ -221,7 +221,7 @@ def calibrate_camera(
         model = build(data, kept)
         check_count(len(data), len(choice.names), model.shared_unknowns, per_half_turn)
     homographies = fit_homographies(data, o_mode, known_o)
-    check_turns(data, homographies)
+    check_turns(data, homographies.residual_px, lens_ahead=bool(lens))
     if len(choice.names) > 2:
         # One plane gives two constraints, and that is enough for two intrinsics.
         check_planes(homographies, noise_known)
@@ -350,6 +350,10 @@ def _refined(
         )
     end, chosen = found
     state = end.state
+    if model.lens:
+        # With the lens there is no more excuse than without one.
+        missed = model.data.pixels - model.predict(state)
+        check_turns(model.data, np.sqrt((missed**2).mean(axis=(1, 2, 3))))
     equations = NormalEquations.of(end.blocks)
     covariance, condition = invert_information(equations.reduced())
     count = model.camera_unknowns

@@ -61,6 +61,7 @@ def make_scene(
     foot: tuple[float, float] = FOOT,
     view: PinholeCamera | None = None,
     tilt_deg: tuple[float, float] = (20.0, 55.0),
+    sideways: float = 0.08,
     azimuths: Sequence[float] | None = None,
     angle_deg: float = 180.0,
     turn_root: Floats | None = None,
@@ -77,7 +78,7 @@ def make_scene(
         lean = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         rotation = so3_exp(lean * np.radians(rng.uniform(*tilt_deg)))
         rotation = rotation @ so3_exp([0.0, 0.0, rng.uniform(0, 2 * np.pi)])
-        centre = np.array([*rng.uniform(-0.08, 0.08, 2), rng.uniform(0.8, 1.0)])
+        centre = np.array([*rng.uniform(-sideways, sideways, 2), rng.uniform(0.8, 1.0)])
         pose = np.eye(4)
         pose[:3, :3] = rotation
         pose[:3, 3] = centre - rotation @ np.append(foot, 0.0)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from half_turn_scene import IMAGE_SIZE, TRIANGLE, make_scene
 
 from handeye_tri.calibrate_cameras import calibrate_camera
+from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
 from handeye_tri.errors import DegenerateMotionError, HandEyeError, InputError
 from handeye_tri.triangle import TriangleRig
 
@@ -104,6 +106,45 @@ def test_exchanged_markers_are_no_half_turn() -> None:
     after[4] = after[4, [1, 0, 2]]
     with pytest.raises(DegenerateMotionError, match="half-turn 4 is no half-turn"):
         calibrate(scene, after=after, o="free")
+
+
+@pytest.fixture(scope="module")
+def bent():
+    """A small triangle turned right across the image of a wide lens.
+
+    No plane fits the two images of some half-turns to a twentieth of its side.
+    """
+    lens = Lens("radtan", np.array([-0.35, 0.13, 1e-3, -5e-4, 0.0]))
+    view = PinholeCamera("c", Intrinsics(450.0, 452.0, 0.0, 519.3, 377.8), (1024, 768))
+    return make_scene(
+        np.random.default_rng(3),
+        20,
+        triangle=TriangleRig(0.04, 0.036, np.radians(65)),
+        foot=(0.4, 0.25),
+        view=replace(view, lens=lens),
+        sideways=0.6,
+    )
+
+
+@pytest.mark.parametrize("reject", [True, False])
+def test_a_bending_lens_is_not_taken_for_a_wrong_turn(bent, reject) -> None:
+    options = {"distortion": ("k1", "k2", "p1", "p2"), "reject": reject}
+    found = calibrate(bent, **options)
+    error = found.camera.intrinsics.vector - bent.camera.intrinsics.vector
+    assert np.abs(error).max() < 1e-7
+    assert len(found.details["used"]) == 20
+    with pytest.raises(DegenerateMotionError, match="no half-turn about 'normal'"):
+        calibrate(bent)
+
+
+def test_behind_a_bending_lens_a_wrong_turn_is_still_one(bent) -> None:
+    lens = ("k1", "k2", "p1", "p2")
+    after = bent.after.copy()
+    after[4] = after[4, [1, 0, 2]]
+    with pytest.raises(DegenerateMotionError, match="half-turn 4 is no half-turn"):
+        calibrate(bent, after=after, distortion=lens)
+    found = calibrate(bent, after=after, distortion=lens, reject=True)
+    assert list(found.details["dropped"]) == [4]
 
 
 def test_views_too_weak_for_the_noise_are_refused_with_sigma() -> None:
