@@ -24,7 +24,9 @@ ROWS: tuple[tuple[str, ...], ...] = (
     ("mechanism", "config"),
     # Plain numpy below what talks to an engine: arm, simulate.
     ("kinematics", "solids"),
-    ("storage", "arm", "exchange"),
+    ("storage", "arm"),
+    # Other tools' files are read with the same care as ours.
+    ("exchange",),
     ("plan", "synthesize", "simulate", "detect"),
     ("calibrate_cameras",),
     ("hand_eye",),

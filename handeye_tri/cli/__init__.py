@@ -9,11 +9,19 @@ from pathlib import Path
 import click
 
 # Each of these adds its verbs to the group.
-from handeye_tri.cli import doctor, experiment, session, solve
+from handeye_tri.cli import doctor, exchange, experiment, session, solve
 from handeye_tri.cli.group import EXIT_CODES, commands
 from handeye_tri.errors import DegenerateMotionError, HandEyeError
 
-__all__ = ["commands", "doctor", "experiment", "main", "session", "solve"]
+__all__ = [
+    "commands",
+    "doctor",
+    "exchange",
+    "experiment",
+    "main",
+    "session",
+    "solve",
+]
 
 
 def _log_bug() -> Path:

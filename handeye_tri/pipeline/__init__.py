@@ -4,7 +4,16 @@ A stage whose inputs and outputs are unchanged is not done again.
 """
 
 from handeye_tri.pipeline.execution import Stage, execute
-from handeye_tri.pipeline.run import Progress, Run, start
+from handeye_tri.pipeline.run import NullProgress, Progress, Run, start
 from handeye_tri.pipeline.stages import STAGES, VERBS
 
-__all__ = ["STAGES", "VERBS", "Progress", "Run", "Stage", "execute", "start"]
+__all__ = [
+    "STAGES",
+    "VERBS",
+    "NullProgress",
+    "Progress",
+    "Run",
+    "Stage",
+    "execute",
+    "start",
+]

@@ -76,7 +76,7 @@ def execute(
             continue
         for name in stage.after:
             if stages[name].verb not in verbs:
-                _require(run, stages, stages[name])
+                require(run, stages, stages[name])
         run.progress.begin(number, len(stages), stage.name)
         inputs = inputs_of(run, stage)
         state, _ = run.folder.state(stage.name, inputs)
@@ -89,10 +89,14 @@ def execute(
         run.progress.end(line, time.perf_counter() - started)
 
 
-def _require(run: Run, stages: Mapping[str, Stage], stage: Stage) -> None:
-    """Raise StorageError unless an earlier stage is done and whole."""
+def require(run: Run, stages: Mapping[str, Stage], stage: Stage) -> None:
+    """See that a stage, and all that it builds on, is done, whole and up to date.
+
+    Raises:
+        StorageError: it is not; names the first stage to run.
+    """
     for name in stage.after:
-        _require(run, stages, stages[name])
+        require(run, stages, stages[name])
     state, why = run.folder.state(stage.name, inputs_of(run, stage))
     if state != "done":
         raise StorageError(

@@ -58,6 +58,19 @@ class Progress(Protocol):
         """The stage ended with its own quality figure; None: it was up to date."""
 
 
+class NullProgress:
+    """Progress that nobody looks at."""
+
+    def begin(self, number: int, total: int, stage: str) -> None:
+        """A stage starts."""
+
+    def advance(self, done: int, total: int) -> None:
+        """So much of the stage is done."""
+
+    def end(self, line: str, seconds: float | None) -> None:
+        """The stage ended."""
+
+
 def software() -> dict[str, str]:
     """Versions of what computes the numbers."""
     found = {}

@@ -1,0 +1,174 @@
+"""A finished session in the formats of other tools."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from handeye_tri import exchange, storage
+from handeye_tri.errors import InputError, StorageError
+from handeye_tri.exchange import CameraFrame, FrameNames, Results
+from handeye_tri.hand_eye.observed_poses import triangle_poses
+from handeye_tri.pipeline.execution import require
+from handeye_tri.pipeline.run import (
+    CAMERAS_SCHEMA,
+    HAND_EYE_SCHEMA,
+    PLAN_SCHEMA,
+    Run,
+)
+from handeye_tri.pipeline.stages import STAGES
+from handeye_tri.records import CameraCalibration
+from handeye_tri.se3 import se3_inverse
+from handeye_tri.storage import codec
+
+# What each is for, in a few words.
+FORMATS = {
+    "camera_info": "ROS camera_info, one YAML per camera, rectified if a pair",
+    "opencv": "OpenCV FileStorage YAML of everything",
+    "kalibr": "Kalibr camchain YAML",
+    "easy_handeye2": "easy_handeye2 .calib, one per camera",
+    "ros2_static_tf": "ROS 2 static transforms: launch file with the commands",
+    "urdf": "URDF joints from the base to the cameras",
+    "tum": "TUM trajectories: the robot's and the observed track",
+    "json": "everything, with its JSON Schema beside it",
+}
+# A JSON text of these and no more is what other tools get of session.json.
+_HEADER = ("software", "cell", "seed", "half_turns", "simulated", "method")
+
+
+def verdict_of(run: Run) -> str:
+    """The verdict of a session whose evaluation is whole and up to date.
+
+    Raises:
+        StorageError: it is not evaluated, or something changed since.
+    """
+    require(run, STAGES, STAGES["evaluate"])
+    return str(run.evaluation()["verdict"])
+
+
+def read_results(run: Run, frames: FrameNames) -> Results:
+    """A calibrated session as the formats take it.
+
+    Raises:
+        StorageError: a file of the session is missing or damaged.
+    """
+    session, hand_eye, evaluation = run.session(), run.hand_eye(), run.evaluation()
+    base_from_first = hand_eye.base_from_camera[0]
+    cameras = CameraCalibration(
+        cameras=hand_eye.cameras,
+        reference_from_camera=tuple(
+            base_from_first.inverse() @ motion for motion in hand_eye.base_from_camera
+        ),
+        covariance=hand_eye.covariance,
+        chi2=hand_eye.chi2,
+        dof=hand_eye.dof,
+        residuals=np.zeros((len(hand_eye.cameras), 0, 3, 2)),
+        condition=0.0,
+        cost_start=0.0,
+        method=hand_eye.method,
+    )
+    observed = triangle_poses(
+        session.triangle,
+        cameras,
+        session.pixels,
+        session.pixel_covariance,
+        session.marker_radii,
+    )
+    return Results(
+        cell=run.cell.name,
+        calibration=hand_eye,
+        verdict=str(evaluation["verdict"]),
+        sentence=str(evaluation["sentence"]),
+        simulated=session.simulated,
+        base_from_flange=session.base_from_flange,
+        stations=tuple(observed.views.tolist()),
+        observed_base_from_flange=base_from_first.matrix
+        @ observed.reference_from_triangle
+        @ se3_inverse(hand_eye.flange_from_triangle.matrix),
+        frames=frames,
+    )
+
+
+def export(
+    run: Run,
+    name: str,
+    path: Path,
+    *,
+    frames: FrameNames,
+    camera_frame: CameraFrame = "mounting",
+) -> tuple[list[Path], Results]:
+    """Write a session's results in one format.
+
+    Args:
+        run: A session that is evaluated.
+        name: One of FORMATS.
+        path: The file; where a format has several, each gets a name before the suffix.
+        frames: What the frames are called.
+        camera_frame: For URDF, where its joint ends.
+
+    Returns:
+        The files written, and what they were written from.
+
+    Raises:
+        InputError: the format cannot hold the result.
+        StorageError: the session is not evaluated, or a file cannot be written.
+    """
+    if path.is_dir():
+        raise StorageError(f"{path}: this is a folder; name a file with -o")
+    results = read_results(run, frames)
+    writers: dict[str, Callable[[], str | Mapping[str, str]]] = {
+        "camera_info": lambda: exchange.camera_info_yaml(results),
+        "opencv": lambda: exchange.opencv_yaml(results),
+        "kalibr": lambda: exchange.kalibr_yaml(results),
+        "easy_handeye2": lambda: exchange.easy_handeye2_calib(results),
+        "ros2_static_tf": lambda: exchange.static_tf_launch(results),
+        "urdf": lambda: exchange.cameras_urdf(results, camera_frame),
+        "tum": lambda: exchange.tum_tracks(results),
+        "json": lambda: _everything(run, results),
+    }
+    if name not in writers:
+        raise InputError(f"there is no format {name!r}; there are {', '.join(writers)}")
+    texts = writers[name]()
+    if isinstance(texts, str):
+        texts = {"": texts}
+    written = []
+    for part, text in texts.items():
+        label = f"{path.stem}_{part}{path.suffix}" if part else path.name
+        storage.write_bytes(path.with_name(label), text.encode())
+        written.append(path.with_name(label))
+    return written, results
+
+
+def _everything(run: Run, results: Results) -> dict[str, str]:
+    folder, header, session = run.folder, run.folder.header, run.session()
+    frames, truth = results.frames, run.truth()
+    data: dict[str, Any] = {
+        "schema": exchange.EXPORT_SCHEMA,
+        "notice": results.head,
+        "frames": {
+            "base": frames.base,
+            "flange": frames.flange,
+            "optical": {
+                camera.name: frames.camera(camera.name)
+                for camera in results.calibration.cameras
+            },
+        },
+        "session": {key: header[key] for key in _HEADER if key in header},
+        "plan": storage.read_json(folder.file("plan.json"), PLAN_SCHEMA),
+        "observations": {
+            "pixels_px": codec.numbers(session.pixels),
+            "pixel_covariance_px2": codec.numbers(session.pixel_covariance),
+        },
+        "cameras": storage.read_json(folder.file("cameras.json"), CAMERAS_SCHEMA),
+        "hand_eye": storage.read_json(folder.file("hand_eye.json"), HAND_EYE_SCHEMA),
+        "evaluation": run.evaluation(),
+        "truth": codec.truth_to_json(*truth) if truth else None,
+    }
+    return {
+        "": json.dumps(data, indent=1, allow_nan=False, ensure_ascii=False) + "\n",
+        "schema": json.dumps(exchange.json_schema(), indent=1) + "\n",
+    }
