@@ -273,15 +273,24 @@ def conic_constraints(matrix: Floats) -> Floats:
     return np.stack([conic_row(h1, h2), conic_row(h1, h1) - conic_row(h2, h2)], axis=-2)
 
 
-def constraint_covariance(homographies: Homographies, b: Floats) -> Floats:
-    """Covariance of the two constraint rows times b, shape (n, 2, 2)."""
+def constraint_derivative(matrix: Floats, b: Floats) -> Floats:
+    """Derivative of the two constraint rows times b by a homography, (n, 2, 8).
+
+    Args:
+        matrix: Shape (n, 3, 3); its first eight elements, by rows, are the variables.
+        b: Shape (6,).
+    """
     w = conic_matrix(b)
-    wh1 = homographies.matrix[..., 0] @ w
-    wh2 = homographies.matrix[..., 1] @ w
-    derivative = np.zeros((len(wh1), 2, 9))
+    wh1, wh2 = matrix[..., 0] @ w, matrix[..., 1] @ w
+    derivative = np.zeros((len(matrix), 2, 9))
     derivative[:, 0, 0::3], derivative[:, 0, 1::3] = wh2, wh1
     derivative[:, 1, 0::3], derivative[:, 1, 1::3] = 2.0 * wh1, -2.0 * wh2
-    derivative = derivative[..., :8]
+    return derivative[..., :8]
+
+
+def constraint_covariance(homographies: Homographies, b: Floats) -> Floats:
+    """Covariance of the two constraint rows times b, shape (n, 2, 2)."""
+    derivative = constraint_derivative(homographies.matrix, b)
     return np.asarray(
         derivative @ homographies.covariance @ np.swapaxes(derivative, -1, -2)
     )

@@ -117,7 +117,8 @@ def calibrate_camera(
         distortion: Lens coefficients to estimate: all of a model, or their names.
         refine: False stops at the closed form.
         method: Closed form by the paper's rows, or by whitened homographies, which
-            are about twice as accurate. With ``refine`` it is only the start.
+            are about twice as accurate and near the Cramer-Rao bound. With ``refine``
+            it is only the start.
         sigma_px: Standard deviation of each pixel coordinate.
         covariance: Instead: covariance of each observed point, (n, 2, 3, 2, 2), px^2.
             With neither, points count alike and the covariance of the result is
