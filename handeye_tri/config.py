@@ -50,8 +50,8 @@ class RigConfig(_Model):
     """The triangle on the flange, and how its markers look.
 
     The flange's z axis is the half-turn axis. "normal": it meets the triangle's
-    plane in the circumcentre. An edge: the edge lies on it, its first vertex
-    ``ahead_mm`` from the flange.
+    plane in O, by default the circumcentre. An edge: the edge lies on it, its first
+    vertex ``ahead_mm`` from the flange.
     """
 
     axis: Axis
@@ -60,6 +60,13 @@ class RigConfig(_Model):
     angle_deg: Annotated[Number, Field(gt=0, lt=180)]
     ahead_mm: Positive
     turn_deg: Number = 0.0
+    o_mm: tuple[Number, Number] | None = Field(
+        None, description="O from A, along AB and across it; a normal axis only"
+    )
+    holder: Literal["rods", "hands", "board"] = Field(
+        "rods",
+        description="rods; a clock's hands (normal axis); a board (an edge)",
+    )
     marker_radii_mm: tuple[Positive, Positive, Positive]
     marker_colours: tuple[tuple[Unit, Unit, Unit], ...] = Field(
         min_length=3, max_length=3, description="A, B, C as red green blue, 0-1"
@@ -72,6 +79,17 @@ class RigConfig(_Model):
             _ = self.triangle
         except InputError as error:
             raise ValueError(str(error)) from None
+        if self.o_mm is not None and self.axis != "normal":
+            raise ValueError(
+                f"o_mm says where a normal axis meets the plane, but axis is {self.axis}; "
+                "leave o_mm out, or use axis: normal"
+            )
+        fits = {"hands": self.axis == "normal", "board": self.axis != "normal"}
+        if not fits.get(self.holder, True):
+            raise ValueError(
+                f"holder: {self.holder} does not hold an axis {self.axis}: a clock's "
+                "hands turn about a normal, a board about an edge; use holder: rods"
+            )
         if self.identity == "colour" and len(set(self.marker_colours)) < 3:
             raise ValueError(
                 "identity: colour needs three different marker_colours; "
@@ -110,7 +128,10 @@ class RigConfig(_Model):
         spin = so3_exp([0.0, 0.0, np.radians(self.turn_deg)])
         if self.axis == "normal":
             # The triangle looks ahead, away from the flange.
-            o = np.append(triangle.circumcentre, 0.0)
+            foot = triangle.circumcentre
+            if self.o_mm is not None:
+                foot = 1e-3 * np.array(self.o_mm)
+            o = np.append(foot, 0.0)
             return SE3.from_parts(spin, ahead - spin @ o)
         start = {"AB": 0, "BC": 1, "CA": 2}[self.axis]
         points = triangle.points
@@ -246,7 +267,7 @@ class PlanConfig(_Model):
     """What a programme must satisfy."""
 
     half_turns: Annotated[Count, Field(ge=2)] = 11
-    evaluation_stations: Count = 6
+    evaluation_stations: Annotated[int, Field(strict=True, ge=0)] = 6
     min_plane_spread_deg: Annotated[Number, Field(gt=0, le=60)] = 20.0
     max_tilt_deg: Annotated[Number, Field(gt=0, lt=90)] = 55.0
     image_margin_px: NotNegative = 20.0

@@ -49,7 +49,7 @@ def summary_text(
         written: Names of the files in the session worth opening, first one first.
     """
     lines = [
-        *_verdict(evaluation),
+        *_verdict(evaluation, cross_check_lines(evaluation)),
         "",
         *_result(evaluation["result"]),
         "",
@@ -63,7 +63,22 @@ def summary_text(
     return "\n".join(lines)
 
 
-def _verdict(evaluation: Mapping[str, Any]) -> list[str]:
+def check_text(checked: Mapping[str, Any]) -> str:
+    """A session judged again from its files.
+
+    Args:
+        checked: Its verdict, as in ``evaluation.json``, and what became of its files.
+    """
+    lines = _verdict(checked, [])
+    lines += ["", f"FILES  {checked['files_verified']} as recorded (SHA-256)"]
+    for stage in checked["stale"]:
+        lines.append(f"STALE  {stage['stage']}: {stage['why']}; {stage['command']}")
+    if checked["recorded_verdict"] not in (None, checked["verdict"]):
+        lines.append(f"BEFORE evaluation.json says {checked['recorded_verdict']}")
+    return "\n".join(lines)
+
+
+def _verdict(evaluation: Mapping[str, Any], remarks: Sequence[str]) -> list[str]:
     track = evaluation["track"]
     gates = evaluation["gates"]
     ran = [gate for gate in gates if gate["verdict"] != "not run"]
@@ -73,11 +88,12 @@ def _verdict(evaluation: Mapping[str, Any]) -> list[str]:
         f"VERDICT  {evaluation['verdict']}      {source}, {len(met)} of {len(ran)} "
         f"gates met, {len(gates) - len(ran)} not run",
         f"  {evaluation['sentence']}",
-        f"  Track test, {track['stations']} held-out stations: "
+        f"  Track test, {tested_stations(track)}: "
         f"{track['mean_mm']:.3f} mm mean, {track['rms_mm']:.3f} rms "
         f"({track['predicted_rms_mm']:.3f} predicted),",
         f"  {track['max_mm']:.3f} worst (station {track['worst_station']}, "
         f"marker {track['worst_marker']}).",
+        *(f"  {remark}" for remark in remarks),
         f"  Nearest to failing: {evaluation['nearest']}.",
         f"  {'gate':<32}{'found':<16}{'limit':<16}{'verdict':<10}blind to",
     ]
@@ -91,6 +107,47 @@ def _verdict(evaluation: Mapping[str, Any]) -> list[str]:
             f"  {finding['code']}: {finding['cause']}; {finding['evidence']}",
             f"    Do: {finding['remedy']}.",
         ]
+    return lines
+
+
+def tested_stations(track: Mapping[str, Any]) -> str:
+    """Which stations the track test was made at, in words."""
+    if track["source"] == "cross-validation":
+        return f"{track['stations']} stations, each left out of its own calibration"
+    return f"{track['stations']} held-out stations"
+
+
+def cross_check_lines(evaluation: Mapping[str, Any]) -> list[str]:
+    """Cross-validation and repeatability, a line each, from ``evaluation.json``."""
+    checks = evaluation["cross_checks"]
+    lines: list[str] = []
+    validation = checks["cross_validation"]
+    if "not_run" in validation:
+        lines.append(f"Cross-validation not run: {validation['not_run']}")
+    elif evaluation["track"]["source"] != "cross-validation":
+        what = (
+            "one half-turn left out at a time"
+            if validation["folds"] == validation["groups"]
+            else f"{validation['folds']} folds"
+        )
+        lines.append(
+            f"Cross-validation, {what}: {validation['rms_mm']:.3f} mm rms "
+            f"({validation['predicted_rms_mm']:.3f} predicted)."
+        )
+    parts = evaluation["track"]["predicted_parts_mm"]
+    stated = math.sqrt(
+        sum(parts[name] ** 2 for name in parts if name not in ("pixels", "robot"))
+    )
+    drawn = checks["bootstrap"]
+    if "not_run" in drawn:
+        lines.append(f"Repeatability not run: {drawn['not_run']}")
+    else:
+        lines.append(
+            f"Calibration's part: {stated:.3f} mm by covariance, "
+            f"{drawn['track_calibration_mm']:.3f} +- "
+            f"{100 * drawn['relative_error']:.0f} % by drawing its "
+            f"{drawn['drawn_from']} half-turns again."
+        )
     return lines
 
 

@@ -68,8 +68,18 @@ def evaluation(calibrated, **changes):
         "simulated": True,
         "gates": [gate, {**gate, "name": "touch test", "verdict": "not run"}],
         "findings": [],
+        "cross_checks": {
+            "cross_validation": {
+                "folds": 11, "groups": 11, "rms_mm": 0.0734, "predicted_rms_mm": 0.0741,
+            },
+            "bootstrap": {
+                "drawn_from": 11, "relative_error": 0.2431,
+                "track_calibration_mm": 0.0327,
+            },
+        },
         "track": {
-            "stations": 6, "mean_mm": 0.0712, "rms_mm": 0.08, "max_mm": 0.15,
+            "source": "held-out stations", "stations": 6,
+            "mean_mm": 0.0712, "rms_mm": 0.08, "max_mm": 0.15,
             "predicted_rms_mm": 0.082, "worst_station": 24, "worst_marker": "B",
             "predicted_parts_mm": {"calibration": 0.03, "pixels": 0.04, "robot": 0.0},
         },
@@ -89,6 +99,29 @@ def test_the_verdict_comes_first_and_the_commands_last(calibrated):
     assert lines[-1] == "NEXT  handeye-tri replay out"
     assert "out/report.html   start here" in text
     assert max(len(line) for line in lines) <= 100
+
+
+def test_cross_checks_stand_beside_the_track_test(calibrated):
+    text = summary_text(evaluation(calibrated), Path("out"), [])
+    assert "Track test, 6 held-out stations: 0.071 mm mean" in text
+    assert (
+        "Cross-validation, one half-turn left out at a time: 0.073 mm rms "
+        "(0.074 predicted)." in text
+    )
+    assert (
+        "0.030 mm by covariance, 0.033 +- 24 % by drawing its 11 half-turns again."
+        in text
+    )
+
+
+def test_a_track_from_cross_validation_is_told_once(calibrated):
+    changed = evaluation(calibrated)
+    changed["track"].update(source="cross-validation", stations=22)
+    changed["cross_checks"]["bootstrap"] = {"not_run": "too few half-turns"}
+    text = summary_text(changed, Path("out"), [])
+    assert "Track test, 22 stations, each left out of its own calibration: " in text
+    assert "Cross-validation" not in text
+    assert "Repeatability not run: too few half-turns" in text
 
 
 def test_without_truth_there_is_no_truth_column(calibrated):

@@ -142,6 +142,37 @@ def calibrate(session: Path, method: str, again: bool) -> None:
     _work(folder, ("calibrate",), again=again)
 
 
+@commands.command(epilog=example("handeye-tri check out", "echo $?"))
+@SESSION
+@click.option("--json", "as_json", is_flag=True, help="Print JSON only.")
+def check(session: Path, as_json: bool) -> None:
+    """Verify a session's files and judge it again; changes nothing.
+
+    The exit code is the verdict's: 0 PASS, 3 FAIL, 4 CANNOT TELL; 2 where a file is
+    missing or is not the one that was recorded.
+    """
+    import json
+
+    from handeye_tri.pipeline import STAGES, Run
+    from handeye_tri.pipeline.checking import check_session
+    from handeye_tri.storage import SessionFolder
+    from handeye_tri.summary import check_text
+
+    cap_threads()
+    progress = StderrProgress()
+    progress.begin(1, 1, "check")
+    try:
+        checked = check_session(Run(SessionFolder.open(session), progress), STAGES)
+    finally:
+        progress.close()
+    click.echo(
+        json.dumps(checked, indent=1, ensure_ascii=False)
+        if as_json
+        else check_text(checked)
+    )
+    sys.exit(EXIT_CODES[checked["verdict"]])
+
+
 @commands.command(epilog=example("handeye-tri replay out --screenshot out.png"))
 @SESSION
 @click.option("--serve", is_flag=True, help="Serve it to a browser, on loopback only.")

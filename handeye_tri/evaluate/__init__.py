@@ -14,6 +14,7 @@ from handeye_tri.evaluate.track import (
     loop_residuals,
     track_budget,
 )
+from handeye_tri.evaluate.track_poses import TrackPoses, track_poses
 from handeye_tri.evaluate.truth import Comparison, compare_with_truth
 from handeye_tri.evaluate.workspace import (
     TrackMap,
@@ -28,6 +29,7 @@ __all__ = [
     "Spread",
     "TrackBudget",
     "TrackMap",
+    "TrackPoses",
     "bootstrap",
     "compare_with_truth",
     "cross_validate",
@@ -38,4 +40,5 @@ __all__ = [
     "track_budget",
     "track_map",
     "track_part",
+    "track_poses",
 ]

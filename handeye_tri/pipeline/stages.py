@@ -6,23 +6,20 @@ numbers whether it ran in one go or was taken up again.
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 import numpy as np
 
 from handeye_tri import storage
 from handeye_tri.errors import InputError
+from handeye_tri.pipeline.evaluation import evaluate, judged_track
 from handeye_tri.pipeline.execution import Stage
 from handeye_tri.pipeline.run import (
     CAMERAS_SCHEMA,
-    EVALUATION_SCHEMA,
     HAND_EYE_SCHEMA,
     PLAN_SCHEMA,
     TRUTH_SCHEMA,
     Run,
 )
 from handeye_tri.storage import codec
-from handeye_tri.summary import result_rows
 
 
 def _plan(run: Run) -> tuple[list[str], str]:
@@ -171,81 +168,12 @@ def _hand_eye(run: Run) -> tuple[list[str], str]:
     )
 
 
-def _evaluate(run: Run) -> tuple[list[str], str]:
-    from handeye_tri.diagnose import assess
-    from handeye_tri.evaluate import compare_with_truth, evaluate_track, track_budget
-
-    session, cameras, hand_eye = run.session(), run.cameras(), run.hand_eye()
-    track = evaluate_track(hand_eye, session)
-    budget = track_budget(hand_eye, session)
-    verdict = assess(
-        session,
-        cameras,
-        hand_eye,
-        track,
-        track_limit=1e-3 * run.cell.track_limit_mm,
-        min_plane_spread=float(np.radians(run.cell.plan.min_plane_spread_deg)),
-    )
-    truth = run.truth()
-    rows = compare_with_truth(hand_eye, truth[0]) if truth else ()
-    worst = int(np.argmax(track.distances))
-    data = {
-        "schema": EVALUATION_SCHEMA,
-        "verdict": verdict.outcome,
-        "sentence": verdict.sentence,
-        "nearest": verdict.nearest,
-        "simulated": session.simulated,
-        "gates": [asdict(gate) for gate in verdict.gates],
-        "findings": [asdict(finding) for finding in verdict.findings],
-        "cameras_chi2_per_dof": cameras.chi2 / cameras.dof,
-        "hand_eye_chi2_per_dof": hand_eye.chi2 / hand_eye.dof,
-        "track": {
-            "stations": len(set(track.stations.tolist())),
-            "mean_mm": 1e3 * track.mean,
-            "rms_mm": 1e3 * track.rms,
-            "max_mm": 1e3 * track.max,
-            "worst_station": int(track.stations[worst]),
-            "worst_marker": "ABC"[track.markers[worst]],
-            "predicted_rms_mm": 1e3 * track.predicted_rms,
-            "predicted_parts_mm": {
-                name: 1e3 * value for name, value in budget.parts().items()
-            },
-            "positions": [
-                {
-                    "station": int(track.stations[r]),
-                    "marker": "ABC"[track.markers[r]],
-                    "reported_m": track.reported[r].tolist(),
-                    "observed_m": track.observed[r].tolist(),
-                    "error_mm": 1e3 * float(track.distances[r]),
-                }
-                for r in range(len(track.stations))
-            ],
-        },
-        "result": result_rows(hand_eye, truth[0] if truth else None),
-        "truth": {
-            row.quantity: {
-                "estimate": row.estimate,
-                "truth": row.truth,
-                "error": row.error,
-                "sigma": row.sigma,
-            }
-            for row in rows
-        },
-    }
-    storage.write_json(run.folder.file("evaluation.json"), data)
-    return ["evaluation.json"], (
-        f"held-out track {1e3 * track.mean:.3f} mm mean, {1e3 * track.max:.3f} worst; "
-        f"predicted {1e3 * track.predicted_rms:.3f} rms; {verdict.outcome}"
-    )
-
-
 def _report(run: Run) -> tuple[list[str], str]:
     from handeye_tri import replay
-    from handeye_tri.evaluate import evaluate_track
     from handeye_tri.report import Origin, render_report
 
     session, hand_eye, evaluation = run.session(), run.hand_eye(), run.evaluation()
-    track = evaluate_track(hand_eye, session)
+    track = judged_track(run, session, hand_eye).track
     truth = run.truth()
     joints = np.array([station.joints for station in session.stations])
     recording = run.folder.file("replay.rrd")
@@ -325,7 +253,8 @@ STAGES = {
             "evaluate",
             ("rig", "arm", "plan", "track_limit_mm"),
             ("plan", "simulate", "detect", "cameras", "hand_eye"),
-            _evaluate,
+            evaluate,
+            ("method",),
         ),
         Stage(
             "report",

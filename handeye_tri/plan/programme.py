@@ -317,8 +317,8 @@ class _Planner:
             certificate[f"sigma.{name}.rotation_deg"] = float(
                 np.degrees(np.linalg.norm(turn))
             )
-        held_out = np.concatenate([c.base_from_flange for c in evaluation])
-        track = model.track_derivatives(held_out)
+        places = np.concatenate([c.base_from_flange for c in evaluation or chosen])
+        track = model.track_derivatives(places)
         errors = np.einsum("nkap,pq,nkaq->nk", track, covariance.matrix, track)
         certificate["track_calibration_rms_mm"] = float(1e3 * np.sqrt(errors.mean()))
         return certificate

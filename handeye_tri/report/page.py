@@ -19,8 +19,9 @@ from handeye_tri.records import (
     Session,
     TrackEvaluation,
 )
-from handeye_tri.report import figures, geometry, tables
+from handeye_tri.report import figures, geometry, spreads, tables
 from handeye_tri.report.figures import Photograph
+from handeye_tri.summary import tested_stations
 
 # So many of the worst views are shown as pictures.
 _CROPS = 6
@@ -125,6 +126,10 @@ def render_report(
         factor=factor,
         expectations=tables.expectations(origin.certificate, session, rows, parts),
         alternatives=tables.alternatives(calibration),
+        tested_stations=tested_stations(evaluation["track"]),
+        validation=evaluation["cross_checks"]["cross_validation"],
+        spreads=spreads.spread_table(evaluation["cross_checks"]),
+        unspread=spreads.not_run(evaluation["cross_checks"]),
         assumptions=tables.assumptions(session, calibration),
         cameras=cameras,
         calibration=calibration,

@@ -17,6 +17,7 @@ from handeye_tri.storage.pose_files import (
     read_moveit_samples,
     read_pose_pairs,
 )
+from handeye_tri.storage.trajectories import write_tum
 
 __all__ = [
     "POSES_SCHEMA",
@@ -37,4 +38,5 @@ __all__ = [
     "write_bytes",
     "write_image",
     "write_json",
+    "write_tum",
 ]

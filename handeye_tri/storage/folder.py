@@ -172,13 +172,19 @@ class SessionFolder:
         outputs = entry.get("outputs")
         if not isinstance(outputs, dict) or not outputs:
             return "damaged", "session.json does not say what it wrote"
-        for name, digest in outputs.items():
+        for name, why in self.verified(stage):
+            if why:
+                return "damaged", f"{name} {why}"
+        return "done", "up to date"
+
+    def verified(self, stage: str) -> Iterator[tuple[str, str]]:
+        """Each file that a finished stage wrote, and what is wrong with it, if so."""
+        for name, digest in self.outputs(stage).items():
             path = self.file(name)
             if not path.is_file():
-                return "damaged", f"{name} is missing"
-            if sha256(path) != digest:
-                return "damaged", f"{name} was changed or damaged"
-        return "done", "up to date"
+                yield name, "is missing"
+            else:
+                yield name, "" if sha256(path) == digest else "was changed or damaged"
 
     def outputs(self, stage: str) -> dict[str, str]:
         """Names and SHA-256 of what a finished stage wrote."""

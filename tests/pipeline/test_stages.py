@@ -238,3 +238,50 @@ def test_an_interrupted_simulation_goes_on_where_it_was(tmp_path):
     kept = [name for name, stamp in left.items() if stamp == stamps(folder).get(name)]
     assert left
     assert sorted(kept) == sorted(left)
+
+
+def test_a_track_test_writes_both_tracks(session):
+    rows = [
+        np.loadtxt(session / f"track_{name}.tum") for name in ("reported", "observed")
+    ]
+    positions = evaluation(session)["track"]["positions"]
+    for table, name in zip(rows, ("reported_m", "observed_m"), strict=True):
+        assert table[:, 1:4].tolist() == [row[name] for row in positions]
+        np.testing.assert_allclose(
+            np.linalg.norm(table[:, 4:], axis=1), 1.0, atol=1e-12
+        )
+        # "ABC" within a station, stations in order.
+        assert table[:, 0].tolist() == [
+            pytest.approx(row["station"] + 0.1 * "ABC".index(row["marker"]))
+            for row in positions
+        ]
+
+
+def test_cross_checks_agree_with_the_covariance(session):
+    result = evaluation(session)
+    checks = result["cross_checks"]
+    validation = checks["cross_validation"]
+    assert (validation["folds"], validation["stations"]) == (11, 22)
+    assert 0.6 < validation["rms_mm"] / validation["predicted_rms_mm"] < 1.5
+    for name, most in (("bootstrap", 2.0), ("parametric_bootstrap", 1.35)):
+        assert 1 / most < checks[name]["rms_ratio_to_covariance"] < most
+        assert checks[name]["failed"] == 0
+    assert "Cross-validation, one half-turn left out" in (
+        (session.parent / "stdout").read_text()
+    )
+
+
+def test_check_judges_again_and_changes_nothing(session):
+    before, result = digests(session), evaluation(session)
+    done = command("check", session, "--json")
+    assert done.returncode == 0, done.stderr
+    checked = json.loads(done.stdout)
+    for key in ("verdict", "sentence", "nearest", "gates", "findings"):
+        assert checked[key] == result[key]
+    assert checked["track"]["positions"] == result["track"]["positions"]
+    assert checked["files_verified"] == len(before) - 1
+    assert checked["stale"] == []
+    text = command("check", session)
+    assert text.returncode == 0
+    assert text.stdout.startswith("VERDICT  PASS")
+    assert digests(session) == before
