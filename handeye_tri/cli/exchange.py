@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _FORMATS = (
     *("camera_info", "opencv", "kalibr", "easy_handeye2", "ros2_static_tf", "urdf"),
-    *("tum", "json"),
+    *("tum", "mcap", "json"),
 )
 
 
@@ -59,7 +59,7 @@ def export(
     """Write a session's results for another tool.
 
     FORMAT: camera_info, opencv, kalibr, easy_handeye2, ros2_static_tf, urdf, tum,
-    json.
+    mcap (the whole session), json.
     """
     from handeye_tri.exchange import FrameNames, static_tf_commands
     from handeye_tri.pipeline import NullProgress, Run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ FORMATS = {
     "ros2_static_tf": "ROS 2 static transforms: launch file with the commands",
     "urdf": "URDF joints from the base to the cameras",
     "tum": "TUM trajectories: the robot's and the observed track",
+    "mcap": "the whole session as a rosbag2/MCAP recording",
     "json": "everything, with its JSON Schema beside it",
 }
 # A JSON text of these and no more is what other tools get of session.json.
@@ -120,6 +122,9 @@ def export(
     if path.is_dir():
         raise StorageError(f"{path}: this is a folder; name a file with -o")
     results = read_results(run, frames)
+    if name == "mcap":
+        storage.write_bytes(path, exchange.session_mcap(_bag(run, results)))
+        return [path], results
     writers: dict[str, Callable[[], str | Mapping[str, str]]] = {
         "camera_info": lambda: exchange.camera_info_yaml(results),
         "opencv": lambda: exchange.opencv_yaml(results),
@@ -172,3 +177,37 @@ def _everything(run: Run, results: Results) -> dict[str, str]:
         "": json.dumps(data, indent=1, allow_nan=False, ensure_ascii=False) + "\n",
         "schema": json.dumps(exchange.json_schema(), indent=1) + "\n",
     }
+
+
+def _bag(run: Run, results: Results) -> exchange.Bag:
+    header, stations = run.folder.header, run.plan().stations
+    about = {
+        "schema": exchange.EXPORT_SCHEMA,
+        "notice": results.head,
+        "session": {key: header[key] for key in _HEADER if key in header},
+    }
+
+    def photograph(camera: str, station: int) -> bytes | None:
+        path = run.folder.file(run.image_name(camera, station))
+        return storage.read_bytes(path) if path.is_file() else None
+
+    bag = exchange.Bag(results, json.dumps(about, ensure_ascii=False), photograph)
+    joints = np.array([station.joints for station in stations])
+    if joints.size == 0:
+        return bag
+    names = exchange.link_names(
+        run.mechanism, results.frames.base, results.frames.flange
+    )
+    world_from_body = run.arm.body_poses(joints)
+    links = []
+    for index, body in enumerate(run.mechanism.bodies[1:], 1):
+        parent_from_world = se3_inverse(world_from_body[:, body.parent])
+        pose = parent_from_world @ world_from_body[:, index]
+        links.append((names[body.parent], names[index], pose))
+    return replace(
+        bag,
+        joint_names=run.arm.joint_names,
+        joints=joints,
+        description=exchange.robot_urdf(run.mechanism, names),
+        links=links,
+    )

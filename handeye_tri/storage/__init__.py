@@ -3,6 +3,7 @@
 from handeye_tri.storage.cells import find_cell, find_model, read_cell, shipped
 from handeye_tri.storage.files import (
     read_arrays,
+    read_bytes,
     read_image,
     read_json,
     sha256,
@@ -27,6 +28,7 @@ __all__ = [
     "find_model",
     "fingerprint",
     "read_arrays",
+    "read_bytes",
     "read_cell",
     "read_image",
     "read_json",
