@@ -41,9 +41,9 @@ _TRIM_FLOOR = 0.15
 _BEHIND_SIGMAS = 1.5
 _MAX_SURPLUS = 0.1
 # Harmonics of the edge's residual that tell its noise: the fit absorbs 0, 1 and 2.
-_NOISE_HARMONICS = slice(3, 11)
-# Not in the scatter, px: an outline seen through a lens is not quite an ellipse.
-_MODEL_ERROR = 0.005
+_NOISE_HARMONICS = np.arange(3, 11)
+# Each has a sine and a cosine: so many numbers does a scatter come from.
+SCATTER_NUMBERS = 2 * len(_NOISE_HARMONICS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +91,9 @@ class EllipseFit:
 
     Attributes:
         ellipses: Shape (m, 6).
-        covariance: Of the centres, shape (m, 2, 2), px^2.
+        gain: Covariance of the centres for an edge of unit scatter, (m, 2, 2), px^2.
+        scatter: Variance of the covers along the edge, at the wavelengths that move
+            the centre, shape (m,).
         misfit: Root mean square distance of the edge from the ellipse beyond what the
             noise behind the edge explains, shape (m,), px.
         usable: Part of the directions that the fit uses, shape (m,).
@@ -101,7 +103,8 @@ class EllipseFit:
     """
 
     ellipses: Floats
-    covariance: Floats
+    gain: Floats
+    scatter: Floats
     misfit: Floats
     usable: Floats
     hidden: Floats
@@ -166,9 +169,11 @@ def fit_ellipses(
 ) -> EllipseFit:
     """Least squares on the covers; directions that do not fit are left out.
 
-    The covariance takes the scatter of the edge about the fit, as it is along this
-    outline, at wavelengths near those that move the centre: it holds for noise of
-    the sensor, blurred or not, and for the staircase of a rendered edge.
+    The scatter is that of the edge about the fit, as it is along this outline, at
+    wavelengths near those that move the centre: it holds for noise of the sensor and
+    for the staircase of a rendered edge. A blur of variance s^2 leaves of the latter's
+    power exp(-(k s / R)^2) at the k-th harmonic of an outline of radius R, and leaves
+    the sensor's noise as it is.
 
     Args:
         edge: The pixels.
@@ -221,20 +226,30 @@ def fit_ellipses(
         ellipses[:, 5] = np.clip(ellipses[:, 5], *BLUR_RANGE)
     count = np.maximum(shown.sum(axis=1), 1)
     kept = np.where(shown, out, 0.0)
-    power = np.abs(np.fft.rfft(kept, axis=1)[:, _NOISE_HARMONICS]) ** 2
+    # Leaving out the largest would leave too small a scatter: a direction that is off
+    # alone is taken for noise here, as far off as noise may be.
+    alone = bad & (bad[:, _BESIDE].sum(axis=2) == 1) & (np.abs(out) > limit)
+    noisy = offered & ~(bad & ~alone)[:, _BESIDE].any(axis=2)
+    scattered = np.where(noisy, np.clip(out, -limit, limit), 0.0)
+    power = np.abs(np.fft.rfft(scattered, axis=1)[:, _NOISE_HARMONICS]) ** 2
     # White noise of variance v in each of k directions has the power k v.
-    variance = power.mean(axis=1) / count
-    variance *= (information * shown).sum(axis=1) / count
+    many = np.maximum(noisy.sum(axis=1), 1)
+    power *= ((information * noisy).sum(axis=1) / many**2)[:, None]
+    sensor = np.minimum(noise**2, power.mean(axis=1))
+    smooth = (ellipses[:, 5:] / ellipses[:, 2:3]) ** 2
+    passed = np.exp(-smooth * _NOISE_HARMONICS**2)
+    stairs = (passed * (power - sensor[:, None])).sum(axis=1) / (passed**2).sum(axis=1)
     expected = (noise**2)[:, None] * shown / np.maximum(information, least)
     expected = expected.sum(axis=1) / count
-    covariance = np.empty((m, 2, 2))
+    gain = np.empty((m, 2, 2))
     inverse = np.linalg.inv(normal)
     for k, part in enumerate(own):
         pull = inverse[k, :2] @ weighted[:, part]
-        covariance[k] = variance[k] * (pull @ pull.T) + _MODEL_ERROR**2 * np.eye(2)
+        gain[k] = pull @ pull.T
     return EllipseFit(
         ellipses,
-        covariance,
+        gain,
+        sensor + np.maximum(stairs, 0.0) * np.exp(-smooth[:, 0]),
         np.sqrt(np.maximum((kept**2).sum(axis=1) / count - expected, 0.0)),
         shown.mean(axis=1),
         (offered & (out < -limit)).mean(axis=1),

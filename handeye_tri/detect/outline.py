@@ -18,6 +18,7 @@ from handeye_tri.detect.ellipse import (
     BLUR_RANGE,
     MAD,
     RAYS,
+    SCATTER_NUMBERS,
     Flags,
     Indices,
     fit_ellipses,
@@ -66,6 +67,7 @@ _MAX_ASTRAY = 0.2
 _MAX_OVAL = 0.35
 _MAX_MISFIT = 0.22
 _BORDER = 1.0
+_MAX_SCATTER_RATIO = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,14 +76,16 @@ class Outlines:
 
     Attributes:
         centres: Shape (m, 2), pixels.
-        covariance: Shape (m, 2, 2), px^2.
+        gain: Covariance of the centres for an edge of unit scatter, (m, 2, 2), px^2.
+        scatter: Variance of the covers along the edge, shape (m,).
         radii: Mean radii, shape (m,), px.
         levels: Levels inside, shape (m,).
         reasons: Why an outline is not usable, None where it is.
     """
 
     centres: Floats
-    covariance: Floats
+    gain: Floats
+    scatter: Floats
     radii: Floats
     levels: Floats
     reasons: tuple[Reason | None, ...]
@@ -107,7 +111,7 @@ def measure(
     ellipses, levels, noise, kept, astray = _first_look(sampler, centres, radii)
     seen = kept.mean(axis=1)
     reasons = [_objection(ellipses[k], image_size, seen[k]) for k in range(m)]
-    covariance = np.full((m, 2, 2), np.nan)
+    gain, scatter = np.full((m, 2, 2), np.nan), np.full(m, np.nan)
     good = np.array([k for k in range(m) if reasons[k] is None], dtype=np.intp)
     if len(good):
         background, weight = _background(
@@ -120,7 +124,7 @@ def measure(
         trusted = ~astray[good].repeat(2, axis=1)
         fit = fit_ellipses(edge, covers, ellipses[good], trusted)
         ellipses[good] = fit.ellipses
-        covariance[good] = fit.covariance
+        gain[good], scatter[good] = fit.gain, fit.scatter
         for k, spot in enumerate(good):
             if (
                 fit.usable[k] < _MIN_USABLE
@@ -135,11 +139,38 @@ def measure(
     flat = np.minimum((ellipses[:, 3:5] ** 2).sum(axis=1), 0.9)
     return Outlines(
         ellipses[:, :2],
-        covariance,
+        gain,
+        scatter,
         ellipses[:, 2] / (1 - flat) ** 0.25,
         levels,
         tuple(reasons),
     )
+
+
+def common_scatter(scatter: Floats) -> Floats:
+    """Scatters of one image's outlines, each known better by the others, (k,).
+
+    One outline's scatter comes from 16 numbers and is off by a third, which would make
+    good weights of bad ones. The outlines of one image share sensor, optics and
+    lighting: their mean is taken, except where one is three times that of the others
+    (by chance in 1 of 300 images), which keeps its own and leaves the mean. A normal
+    error over a scatter from n numbers follows Student's t distribution, whose
+    variance is n / (n - 2) times as large.
+
+    Args:
+        scatter: Of each outline, shape (k,).
+    """
+    together = np.full(len(scatter), len(scatter))
+    result = np.full(len(scatter), scatter.mean() if len(scatter) else 0.0)
+    worst = int(scatter.argmax()) if len(scatter) > 1 else 0
+    if len(scatter) > 1:
+        rest = np.delete(scatter, worst).mean()
+        if scatter[worst] > _MAX_SCATTER_RATIO * rest:
+            together -= 1
+            result[:] = rest
+            together[worst], result[worst] = 1, scatter[worst]
+    numbers = SCATTER_NUMBERS * together
+    return np.asarray(result * numbers / (numbers - 2))
 
 
 def _objection(
