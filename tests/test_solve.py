@@ -8,6 +8,7 @@ import pytest
 
 from handeye_tri import cli
 from handeye_tri.errors import DegenerateMotionError
+from handeye_tri.hand_eye import solve_pose_pairs
 from handeye_tri.records import PosePairs
 from handeye_tri.se3 import (
     rotation_from_quaternion_wxyz,
@@ -52,6 +53,38 @@ def simulated(mounting):
     b = se3_inverse(seen) if mounting == "eye_in_hand" else seen
     robot = z @ b @ se3_inverse(x)
     return robot, observe(robot, x, z, mounting, rng), mounting, x, z
+
+
+def streams():
+    """A real arm's stream beside a camera's, brought on one clock."""
+    folder = DATA / "eth_robot_arm" / "robot_arm"
+    if not folder.is_dir():
+        pytest.skip(f"the recorded streams are not at {folder}")
+    times, poses = [], []
+    for name in ("base_link_sr300_hinge", "target_ir"):
+        rows = np.loadtxt(
+            folder / f"robot_arm_complete_bag_color_and_ir_{name}.csv", delimiter=","
+        )
+        later = rows[1:, 0] > np.maximum.accumulate(rows[:, 0])[:-1]
+        rows = rows[np.append(True, later)]
+        motions = np.tile(np.eye(4), (len(rows), 1, 1))
+        motions[:, :3, :3] = rotation_from_quaternion_wxyz(rows[:, [7, 4, 5, 6]])
+        motions[:, :3, 3] = rows[:, 1:4]
+        times.append(rows[:, 0] - 1487321563.0)
+        poses.append(motions)
+    stated = ("eye_in_hand", "flange_in_base", "camera_in_target")
+    solution = solve_pose_pairs(
+        PosePairs(
+            poses[0],
+            poses[1][::40],
+            *stated,
+            robot_times=times[0],
+            observed_times=times[1][::40],
+        )
+    )
+    kept = solution.used
+    robot, observed = solution.base_from_flange[kept], se3_inverse(solution.b[kept])
+    return robot, observed, stated[0], solution.x.matrix, solution.z.matrix
 
 
 def real():
@@ -231,6 +264,85 @@ def test_a_third_of_wrong_poses_still_passes_with_their_names(source):
     assert sorted(map(int, solved.solution.dropped)) == sorted(wrong)
     assert np.linalg.norm(solved.solution.x.translation - x[:3, 3]) < 4e-3
     assert solved_text(solved).count("DROPPED") == len(wrong)
+
+
+def without_turning(robot, observed, x, z, mounting):
+    rng = np.random.default_rng(5)
+    still = np.tile(robot[0], (15, 1, 1))
+    still[:, :3, 3] += 0.1 * rng.standard_normal((15, 3))
+    return {"robot": still, "observed": observe(still, x, z, mounting, rng)}
+
+
+def about_one_axis(robot, observed, x, z, mounting):
+    rng = np.random.default_rng(6)
+    turned = np.zeros((15, 6))
+    turned[:, :3] = 0.1 * rng.standard_normal((15, 3))
+    turned[:, 3:] = np.outer(rng.uniform(-0.8, 0.8, 15), (0.6, 0.0, 0.8))
+    poses = robot[0] @ se3_exp(turned)
+    return {"robot": poses, "observed": observe(poses, x, z, mounting, rng)}
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return streams()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "outcome", "code"),
+    [
+        (lambda *_: {}, "PASS", None),
+        (lambda r, o, *_: {"observed": scaled(o, 1e3)}, "FAIL", "SCALE"),
+        (lambda *_: {"robot_direction": "base_in_flange"}, "FAIL", "READING"),
+        (lambda *_: {"mounting": "eye_to_hand"}, "FAIL", "READING"),
+        (lambda r, o, *_: {"observed": np.roll(o, 1, axis=0)}, "FAIL", "READING"),
+        (without_turning, "CANNOT TELL", "MOTION"),
+        (about_one_axis, "CANNOT TELL", "MOTION"),
+        (
+            lambda r, o, *_: {"robot": r[:3], "observed": o[:3]},
+            "CANNOT TELL",
+            "FEW",
+        ),
+    ],
+    ids=[
+        "right",
+        "unit",
+        "inverted",
+        "mounting",
+        "shifted",
+        "no-turn",
+        "one-axis",
+        "three",
+    ],
+)
+def test_wrong_inputs_of_a_recorded_stream(recorded, spoil, outcome, code):
+    robot, observed, mounting, x, z = recorded
+    given = {
+        "robot": robot,
+        "observed": observed,
+        "mounting": mounting,
+        "robot_direction": "flange_in_base",
+        "observed_direction": "target_in_camera",
+        **spoil(robot, observed, x, z, mounting),
+    }
+    # The recording leaves 7 mm in the median.
+    solved = solve_and_judge(PosePairs(**given), limit_position=0.03)
+    assert solved.verdict.outcome == outcome
+    assert codes(solved)[:1] == ([] if code is None else [code])
+    # Every other reading was solved, and is shown.
+    keys = [reading.key for reading in solved.readings]
+    several = ["later", "earlier"] if len(solved.solution.poses) > 3 else []
+    assert keys == ["stated", "inverted", *several, "scaled"]
+    assert solved_text(solved).count(" deg   ") >= len(keys)
+
+
+@pytest.mark.parametrize("spoil", [without_turning, about_one_axis])
+def test_exact_poses_do_not_determine_more_than_noisy_ones(spoil):
+    robot, observed, mounting, x, z = simulated("eye_in_hand")
+    poses = spoil(robot, observed, x, z, mounting)["robot"]
+    seen = se3_inverse(se3_inverse(z) @ poses @ x)
+    solved = judge(poses, seen, mounting)
+    assert solved.verdict.outcome == "CANNOT TELL"
+    assert codes(solved)[0] == "MOTION"
 
 
 def test_inverting_both_sides_cannot_be_seen_and_the_gate_says_so():

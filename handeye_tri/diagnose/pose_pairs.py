@@ -22,6 +22,7 @@ from handeye_tri.records import PosePairs
 
 # Fewer poses leave so few redundant numbers that wrong input can fit by chance.
 _LEAST_POSES = 6
+_FEWEST = 3
 _MOST_DROPPED = 0.3
 # Robots that calibrate move by this much, metres; else the unit is doubtful.
 _PLAUSIBLE = (0.005, 10.0)
@@ -131,8 +132,12 @@ def assess_pose_pairs(
         else f"The poses contradict what is stated about them: {misread.meaning}."
     )
     verdict = judge(tuple(gates), sentence, _remedies(solution, readings))
-    # Causes before what follows from them.
-    findings = sorted(verdict.findings, key=lambda one: one.code in _CONSEQUENCES)
+    # Causes before what follows from them; so few poses that anything fits are one,
+    # unless another reading stands out.
+    few = "" if misread is not None and count > _FEWEST else "FEW"
+    findings = sorted(
+        verdict.findings, key=lambda one: (one.code != few, one.code in _CONSEQUENCES)
+    )
     return replace(verdict, findings=tuple(findings))
 
 

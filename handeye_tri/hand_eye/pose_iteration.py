@@ -288,7 +288,8 @@ class PoseIteration:
         chi2 = float(self.weights @ distances)
         dof = max(6 * n - unknowns, 0)
         excess = max(chi2 / dof, 1.0) if self.stated and dof else 1.0
-        above = self.values / (_NOISE_INFORMATION * n * excess)
+        # In exact data rounding pretends more than noise could.
+        above = self.values / max(_NOISE_INFORMATION * n * excess, self.least)
         back = np.ones(len(covariance))
         back[[0, 1, 2, 6, 7, 8]] = self.length
         sigma = np.exp(0.5 * self.log_variances) / np.sqrt(1 - self.correlation**2)
