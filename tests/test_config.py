@@ -75,6 +75,11 @@ def test_normal_rig_meets_its_plane_in_the_circumcentre(turn: float) -> None:
     assert config.flange_from_triangle.rotation[:, 2] == pytest.approx([0, 0, 1])
 
 
+def test_a_normal_rig_may_state_its_axis() -> None:
+    found = rig(o_mm=(31.0, 12.5)).flange_from_triangle
+    np.testing.assert_allclose(found.apply([0.031, 0.0125, 0.0])[:2], 0.0, atol=1e-15)
+
+
 @pytest.mark.parametrize("axis", [a for a in AXES if a != "normal"])
 def test_edge_rig_has_its_edge_on_the_flange_axis(axis: str) -> None:
     """Turning by 180 degrees about z keeps the edge and mirrors the third marker."""
@@ -211,6 +216,16 @@ UNKNOWN = "this key is not known here"
             put("rig", "marker_colours", [[1, 0, 0], [1, 0, 0], [0, 0, 1]]),
             "rig: identity: colour needs three different marker_colours; use three "
             "colours, or identity: radius",
+        ),
+        (
+            put("rig", "holder", "board"),
+            "rig: holder: board does not hold an axis normal: a clock's hands turn "
+            "about a normal, a board about an edge; use holder: rods",
+        ),
+        (
+            lambda cell: cell["rig"].update(axis="CA", o_mm=[10.0, 20.0]),
+            "rig: o_mm says where a normal axis meets the plane, but axis is CA; leave "
+            "o_mm out, or use axis: normal",
         ),
         (
             put("rig", "identity", "radius"),

@@ -6,6 +6,7 @@ MuJoCo is the only engine that reads model files; kinematics and collision use t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,8 @@ from handeye_tri.simulate.arrays import (
     mechanism_of,
 )
 from handeye_tri.simulate.engine import import_mujoco, one_line
-from handeye_tri.simulate.rods import rig_rods
+from handeye_tri.simulate.props import Prop, add_prop
+from handeye_tri.simulate.rods import rig_board, rig_rods
 
 if TYPE_CHECKING:
     from handeye_tri.config import Cell
@@ -33,7 +35,7 @@ CELL = "cell"
 _SETTINGS = ("option", "visual", "stat", "memory", "nkey")
 # Solid and drawn.
 _SOLID = {"contype": 1, "conaffinity": 1, "group": 0}
-_GREYS = {"rod": 0.25, "surroundings": 0.48, "housing": 0.16}
+_GREYS = {"rod": 0.25, "surroundings": 0.48, "housing": 0.16, "board": 0.78}
 # Optical frames look along z with y down, MuJoCo's along -z with y up.
 _OPTICAL_FROM_MUJOCO = np.diag([1.0, -1.0, -1.0])
 
@@ -56,8 +58,16 @@ def compile_mechanism(cell: Cell, model_path: Path) -> Mechanism:
     return compile_cell(cell, model_path)[1]
 
 
-def compile_cell(cell: Cell, model_path: Path) -> tuple[Any, Mechanism]:
-    """:func:`compile_mechanism`, and the ``mujoco.MjModel`` that it copies."""
+def compile_cell(
+    cell: Cell, model_path: Path, props: Sequence[Prop] = ()
+) -> tuple[Any, Mechanism]:
+    """:func:`compile_mechanism`, and the ``mujoco.MjModel`` that it copies.
+
+    Args:
+        cell: As there.
+        model_path: As there.
+        props: What stands in the cell for some views.
+    """
     mujoco = import_mujoco()
     arm = _load(mujoco, model_path)
     frames = find_frames(cell, model_path, _compile_spec(arm, model_path))
@@ -77,6 +87,8 @@ def compile_cell(cell: Cell, model_path: Path) -> tuple[Any, Mechanism]:
     _add_surroundings(mujoco, spec, cell)
     _add_cameras(mujoco, spec, cell)
     _add_rig(mujoco, spec, cell, frames)
+    for prop in props:
+        add_prop(mujoco, spec, prop)
     model = _compile_spec(spec, model_path)
     return model, mechanism_of(cell, model_path, model, frames)
 
@@ -205,6 +217,17 @@ def _add_rig(mujoco: Any, spec: Any, cell: Cell, frames: ArmFrames) -> None:
             size=[rod.radius, 0.0, 0.0],
             fromto=[*rod.start, *rod.end],
             material=steel.name,
+            **_SOLID,
+        )
+    board = rig_board(cell.rig)
+    if board is not None:
+        card = spec.add_material(name=f"{RIG}/card", rgba=_grey(_GREYS["board"]))
+        mesh = spec.add_mesh(name=f"{RIG}/board", uservert=board.ravel())
+        rig.add_geom(
+            name=f"{RIG}/board",
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=mesh.name,
+            material=card.name,
             **_SOLID,
         )
     markers = cell.rig.flange_from_triangle.apply(cell.rig.triangle.points)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from handeye_tri.errors import InputError
 from handeye_tri.simulate.compile import CELL, compile_cell
 from handeye_tri.simulate.engine import canvas, import_mujoco
 from handeye_tri.simulate.imaging import Image, Optics, Pinhole, develop
+from handeye_tri.simulate.props import Prop, place_prop
 
 if TYPE_CHECKING:
     from handeye_tri.config import Cell
@@ -44,6 +45,7 @@ def render_views(
     joints: ArrayLike,
     seed: int,
     wanted: Iterable[tuple[int, int]],
+    props: Sequence[Prop] = (),
 ) -> Iterator[tuple[int, int, Image]]:
     """Photograph the arm at its stations.
 
@@ -53,6 +55,7 @@ def render_views(
         joints: True joints at the n stations, shape (n, q), rad or m.
         seed: Of the sensor noise; each view has its own stream.
         wanted: Pairs (camera index, station index).
+        props: What stands in the cell at some stations.
 
     Yields:
         Camera index, station index, and the image: RGB, shape (h, w, 3), or (h, w)
@@ -64,7 +67,7 @@ def render_views(
         MissingDependencyError: OpenGL is missing.
     """
     mujoco = import_mujoco()
-    model, mechanism = compile_cell(cell, model_path)
+    model, mechanism = compile_cell(cell, model_path, props)
     order = [int(model.jnt_qposadr[k]) for k in mechanism.arm_joints]
     q = np.asarray(joints, dtype=float)
     if q.ndim != 2 or q.shape[1] != len(order):
@@ -88,6 +91,8 @@ def render_views(
 
     def draw(view: tuple[int, int]) -> Image:
         i, j = view
+        for prop in props:
+            place_prop(model, prop, j)
         data.qpos[:] = model.qpos0
         data.qpos[order] = q[j]
         mujoco.mj_kinematics(model, data)

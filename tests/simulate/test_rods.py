@@ -7,7 +7,7 @@ import pytest
 
 from handeye_tri.config import RigConfig
 from handeye_tri.errors import InputError
-from handeye_tri.simulate.rods import rig_rods
+from handeye_tri.simulate.rods import rig_board, rig_rods
 from handeye_tri.storage.cells import read_cell
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
@@ -90,6 +90,49 @@ def test_a_fork_is_flat_in_the_triangles_plane(turn: float) -> None:
     normal = rig.flange_from_triangle.rotation[:, 2]
     ends = np.array([(rod.start, rod.end) for rod in rig_rods(rig)])
     assert np.abs(ends @ normal).max() < 1e-12
+
+
+def test_a_clocks_balls_sit_on_its_hands() -> None:
+    rig = rig_of("clock_dial")
+    markers = rig.flange_from_triangle.apply(rig.triangle.points)
+    shaft, *hands = rig_rods(rig)
+    assert len(hands) == 3
+    for marker, hand in zip(markers, hands, strict=True):
+        assert (hand.start == shaft.end).all()
+        gap = distance(marker, hand.start, hand.end) - hand.radius - 8e-3
+        assert -0.3e-3 < gap < 0
+        # Below the ball: whoever looks at the dial's face sees its whole outline.
+        assert max(hand.start[2], hand.end[2]) + hand.radius < marker[2] - 7e-3
+    # B and C are the two ends of one hand, through the shaft, A is on the other.
+    a, b, c = (markers - shaft.end)[:, :2]
+    cosines = [
+        p @ q / np.linalg.norm(p) / np.linalg.norm(q) for p, q in ((b, c), (a, b))
+    ]
+    assert cosines[0] < -0.999999
+    assert abs(cosines[1]) < 0.5
+
+
+def test_a_board_leaves_the_outlines_free() -> None:
+    rig = rig_of("triangle_board")
+    corners = rig_board(rig)
+    assert corners is not None
+    assert corners.shape == (12, 3)
+    markers = rig.flange_from_triangle.apply(rig.triangle.points)
+    normal = rig.flange_from_triangle.rotation[:, 2]
+    assert np.abs((corners - markers[0]) @ normal) == pytest.approx(1.5e-3)
+    # The least distance that hides nothing at 55 degrees, and the corner's cut.
+    for marker in markers:
+        near = np.sort(np.linalg.norm(corners - marker, axis=1))[:4]
+        middle = near[0] * np.cos(np.radians(35))
+        assert middle > 9e-3 / np.cos(np.radians(55))
+    assert rig_board(rig_of("hp3_stereo_edge")) is None
+
+
+def test_the_board_hangs_on_the_fork() -> None:
+    *fork, spar = rig_rods(rig_of("triangle_board"))
+    assert spar.name == "spar"
+    bar = next(rod for rod in fork if rod.name == "bar")
+    assert distance(spar.start, bar.start, bar.end) < 1e-9
 
 
 def test_a_marker_behind_the_fork_is_refused() -> None:
