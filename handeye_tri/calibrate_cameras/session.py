@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 # hand-eye step: by this lever an orientation error of the robot moves the rig; metres.
 _LEVER = 0.1
 # Correlations of detection errors that are tried where markers lie on the axis.
-_CORRELATIONS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
+_CORRELATIONS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 0.96, 0.985)
 
 
 def turn_covariance(repeatability: Repeatability) -> Floats:
