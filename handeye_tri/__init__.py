@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         calibrate_camera,
         calibrate_cameras_general,
         calibrate_session_cameras,
+        calibrate_trials,
     )
     from handeye_tri.camera import Intrinsics, Lens, PinholeCamera, StereoRig
     from handeye_tri.errors import HandEyeError
@@ -55,6 +56,7 @@ _HOMES = {
     "calibrate_cameras_general": "calibrate_cameras",
     "calibrate_hand_eye": "hand_eye",
     "calibrate_session_cameras": "calibrate_cameras",
+    "calibrate_trials": "calibrate_cameras",
     "evaluate_track": "evaluate",
     "solve_axxb": "hand_eye",
     "solve_axzb": "hand_eye",
@@ -80,6 +82,7 @@ __all__ = [
     "calibrate_cameras_general",
     "calibrate_hand_eye",
     "calibrate_session_cameras",
+    "calibrate_trials",
     "evaluate_track",
     "solve_axxb",
     "solve_axzb",

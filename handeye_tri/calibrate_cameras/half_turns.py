@@ -110,7 +110,7 @@ def read_half_turns(
     """
     pixels = _pixels(before, after)
     n = len(pixels)
-    axes = _axes(axis, n)
+    axes = read_axes(axis, n)
     whitener = _whitener(sigma_px, covariance, n)
     complete = np.isfinite(pixels).all(axis=(1, 2, 3))
     complete &= np.isfinite(whitener).all(axis=(1, 2, 3, 4))
@@ -168,7 +168,12 @@ def _pixels(before: ArrayLike, after: ArrayLike) -> Floats:
     return np.stack(both, axis=1)
 
 
-def _axes(axis: Axis | Sequence[Axis], n: int) -> tuple[Axis, ...]:
+def read_axes(axis: Axis | Sequence[Axis], n: int) -> tuple[Axis, ...]:
+    """The axis of each of n half-turns.
+
+    Raises:
+        InputError: their number does not fit, or a name is unknown.
+    """
     axes: tuple[Any, ...] = (axis,) * n if isinstance(axis, str) else tuple(axis)
     if len(axes) != n:
         raise InputError(

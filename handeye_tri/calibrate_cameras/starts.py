@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 # Focal length of the generic second start over the longer side of the image: too
 # long rather than too short, from where the descent is smoother.
-_GENERIC_FOCAL = 2.5
+GENERIC_FOCAL = 2.5
 
 
 def blank_state(
@@ -55,7 +55,7 @@ def refinement_starts(
 ) -> dict[str, State]:
     """States to start from by name, the closed form first where there is one."""
     width, height = model.data.image_size
-    focal = _GENERIC_FOCAL * max(width, height)
+    focal = GENERIC_FOCAL * max(width, height)
     generic = np.diag([focal, focal, 1.0])
     generic[:2, 2] = 0.5 * (width - 1), 0.5 * (height - 1)
     poses = poses_from_homographies(generic, homographies, model.data.triangle)

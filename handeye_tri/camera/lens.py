@@ -171,7 +171,7 @@ def distort_jacobians(
     """Distorted points with derivatives.
 
     Args:
-        coefficients: Shape (5,) or (8,).
+        coefficients: Shape (5,) or (8,), or (5, ...) or (8, ...) for several lenses.
         normalised: Shape (..., 2), ideal normalised coordinates.
 
     Returns:
