@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -29,11 +29,21 @@ Switch = Annotated[bool, Field(strict=True)]
 Point = tuple[Number, Number, Number]
 
 
+_Kind = TypeVar("_Kind", bound=BaseModel)
+
+
 class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class ArmConfig(_Model):
+class RobotAccuracy(_Model):
+    """What is to be known of any robot: one standard deviation per axis."""
+
+    repeatability_mm: NotNegative
+    repeatability_deg: NotNegative
+
+
+class ArmConfig(RobotAccuracy):
     """The robot: which model, which frames, how repeatable."""
 
     model: str = Field(description="MJCF or URDF; a path, or a name in robot_models")
@@ -46,27 +56,13 @@ class ArmConfig(_Model):
     repeatability_deg: NotNegative = 0.005
 
 
-class RigConfig(_Model):
-    """The triangle on the flange, and how its markers look.
-
-    The flange's z axis is the half-turn axis. "normal": it meets the triangle's
-    plane in O, by default the circumcentre. An edge: the edge lies on it, its first
-    vertex ``ahead_mm`` from the flange.
-    """
+class TriangleConfig(_Model):
+    """The triangle, the axis it turns about, and how its markers look."""
 
     axis: Axis
     side_ab_mm: Positive
     side_ac_mm: Positive
     angle_deg: Annotated[Number, Field(gt=0, lt=180)]
-    ahead_mm: Positive
-    turn_deg: Number = 0.0
-    o_mm: tuple[Number, Number] | None = Field(
-        None, description="O from A, along AB and across it; a normal axis only"
-    )
-    holder: Literal["rods", "hands", "board"] = Field(
-        "rods",
-        description="rods; a clock's hands (normal axis); a board (an edge)",
-    )
     marker_radii_mm: tuple[Positive, Positive, Positive]
     marker_colours: tuple[tuple[Unit, Unit, Unit], ...] = Field(
         min_length=3, max_length=3, description="A, B, C as red green blue, 0-1"
@@ -74,22 +70,11 @@ class RigConfig(_Model):
     identity: Literal["colour", "radius"]
 
     @model_validator(mode="after")
-    def _distinguishable(self) -> RigConfig:
+    def _distinguishable(self) -> TriangleConfig:
         try:
             _ = self.triangle
         except InputError as error:
             raise ValueError(str(error)) from None
-        if self.o_mm is not None and self.axis != "normal":
-            raise ValueError(
-                f"o_mm says where a normal axis meets the plane, but axis is {self.axis}; "
-                "leave o_mm out, or use axis: normal"
-            )
-        fits = {"hands": self.axis == "normal", "board": self.axis != "normal"}
-        if not fits.get(self.holder, True):
-            raise ValueError(
-                f"holder: {self.holder} does not hold an axis {self.axis}: a clock's "
-                "hands turn about a normal, a board about an edge; use holder: rods"
-            )
         if self.identity == "colour" and len(set(self.marker_colours)) < 3:
             raise ValueError(
                 "identity: colour needs three different marker_colours; "
@@ -119,6 +104,40 @@ class RigConfig(_Model):
             1e-3 * self.side_ac_mm,
             float(np.radians(self.angle_deg)),
         )
+
+
+class RigConfig(TriangleConfig):
+    """The triangle on the flange, as built.
+
+    The flange's z axis is the half-turn axis. "normal": it meets the triangle's
+    plane in O, by default the circumcentre. An edge: the edge lies on it, its first
+    vertex ``ahead_mm`` from the flange.
+    """
+
+    ahead_mm: Positive
+    turn_deg: Number = 0.0
+    o_mm: tuple[Number, Number] | None = Field(
+        None, description="O from A, along AB and across it; a normal axis only"
+    )
+    holder: Literal["rods", "hands", "board"] = Field(
+        "rods",
+        description="rods; a clock's hands (normal axis); a board (an edge)",
+    )
+
+    @model_validator(mode="after")
+    def _held(self) -> RigConfig:
+        if self.o_mm is not None and self.axis != "normal":
+            raise ValueError(
+                "o_mm says where a normal axis meets the plane, but axis is "
+                f"{self.axis}; leave o_mm out, or use axis: normal"
+            )
+        fits = {"hands": self.axis == "normal", "board": self.axis != "normal"}
+        if not fits.get(self.holder, True):
+            raise ValueError(
+                f"holder: {self.holder} does not hold an axis {self.axis}: a clock's "
+                "hands turn about a normal, a board about an edge; use holder: rods"
+            )
+        return self
 
     @property
     def flange_from_triangle(self) -> SE3:
@@ -187,11 +206,28 @@ class EstimateConfig(_Model):
         return self
 
 
-class CameraConfig(_Model):
-    """One camera: its truth (for simulation), place, and what is estimated."""
+class CameraToCalibrate(_Model):
+    """What is to be known of any camera, and what is estimated of it."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
     image_size_px: tuple[Count, Count]
+    estimate: EstimateConfig = EstimateConfig()
+
+    @property
+    def info(self) -> CameraInfo:
+        """What the estimators may know."""
+        return CameraInfo(
+            self.name,
+            self.image_size_px,
+            self.estimate.skew,
+            self.estimate.lens,
+            self.estimate.lens_model,
+        )
+
+
+class CameraConfig(CameraToCalibrate):
+    """One camera's truth and place, for planning and simulation."""
+
     focal_px: tuple[Positive, Positive]
     principal_point_px: tuple[Number, Number]
     skew_px: Number = 0.0
@@ -199,7 +235,6 @@ class CameraConfig(_Model):
     position_m: Point
     look_at_m: Point
     roll_deg: Number = 0.0
-    estimate: EstimateConfig = EstimateConfig()
 
     @model_validator(mode="after")
     def _looks_somewhere(self) -> CameraConfig:
@@ -217,17 +252,6 @@ class CameraConfig(_Model):
             Intrinsics(fx, fy, self.skew_px, cx, cy),
             self.image_size_px,
             self.lens.lens if self.lens else Lens(),
-        )
-
-    @property
-    def info(self) -> CameraInfo:
-        """What the estimators may know."""
-        return CameraInfo(
-            self.name,
-            self.image_size_px,
-            self.estimate.skew,
-            self.estimate.lens,
-            self.estimate.lens_model,
         )
 
     @property
@@ -263,12 +287,17 @@ class BoxConfig(_Model):
     position_m: Point
 
 
-class PlanConfig(_Model):
+class MotionConfig(_Model):
+    """What any robot's motions must satisfy."""
+
+    min_plane_spread_deg: Annotated[Number, Field(gt=0, le=60)] = 20.0
+
+
+class PlanConfig(MotionConfig):
     """What a programme must satisfy."""
 
     half_turns: Annotated[Count, Field(ge=2)] = 11
     evaluation_stations: Annotated[int, Field(strict=True, ge=0)] = 6
-    min_plane_spread_deg: Annotated[Number, Field(gt=0, le=60)] = 20.0
     max_tilt_deg: Annotated[Number, Field(gt=0, lt=90)] = 55.0
     image_margin_px: NotNegative = 20.0
     workspace_min_m: Point
@@ -285,27 +314,21 @@ class PlanConfig(_Model):
         return self
 
 
-class Cell(_Model):
-    """Everything about a cell."""
+class CellToCalibrate(_Model):
+    """What calibration needs to know of a cell, simulated or real."""
 
-    schema_: Literal["handeye_tri.cell/1"] = Field(alias="schema")
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
-    arm: ArmConfig
-    rig: RigConfig
-    cameras: tuple[CameraConfig, ...] = Field(min_length=2)
-    imaging: ImagingConfig = ImagingConfig()
-    surroundings: tuple[BoxConfig, ...] = ()
-    plan: PlanConfig
+    arm: RobotAccuracy
+    rig: TriangleConfig
+    cameras: tuple[CameraToCalibrate, ...] = Field(min_length=2)
+    plan: MotionConfig = MotionConfig()
     track_limit_mm: Positive = 1.0
 
     @model_validator(mode="after")
-    def _names(self) -> Cell:
+    def _cameras_differ(self) -> CellToCalibrate:
         names = [camera.name for camera in self.cameras]
         if len(set(names)) < len(names):
             raise ValueError(f"camera names must differ, got {names}")
-        boxes = [box.name for box in self.surroundings]
-        if len(set(boxes)) < len(boxes):
-            raise ValueError(f"names of surroundings must differ, got {boxes}")
         return self
 
     @property
@@ -317,8 +340,36 @@ class Cell(_Model):
         )
 
 
+class MeasuredCell(CellToCalibrate):
+    """A real cell of which nothing is designed here: no model, no nominal cameras."""
+
+    schema_: Literal["handeye_tri.measured_cell/1"] = Field(alias="schema")
+
+
+class Cell(CellToCalibrate):
+    """Everything about a cell that can be planned and simulated."""
+
+    schema_: Literal["handeye_tri.cell/1"] = Field(alias="schema")
+    arm: ArmConfig
+    rig: RigConfig
+    cameras: tuple[CameraConfig, ...] = Field(min_length=2)
+    imaging: ImagingConfig = ImagingConfig()
+    surroundings: tuple[BoxConfig, ...] = ()
+    plan: PlanConfig
+
+    @model_validator(mode="after")
+    def _boxes_differ(self) -> Cell:
+        boxes = [box.name for box in self.surroundings]
+        if len(set(boxes)) < len(boxes):
+            raise ValueError(f"names of surroundings must differ, got {boxes}")
+        return self
+
+
+_MEASURED = "handeye_tri.measured_cell/1"
+
+
 def parse_cell(data: Mapping[str, object], source: str) -> Cell:
-    """Check a cell description.
+    """Check the description of a cell that can be planned and simulated.
 
     Args:
         data: What the YAML file holds.
@@ -327,8 +378,25 @@ def parse_cell(data: Mapping[str, object], source: str) -> Cell:
     Raises:
         InputError: unknown key, missing unit, impossible value; names each key.
     """
+    if data.get("schema") == _MEASURED:
+        raise InputError(
+            f"{source}: this describes a cell that was measured ({_MEASURED}), which "
+            "can be imported into but neither planned nor simulated; for that write "
+            "schema: handeye_tri.cell/1 and its keys, see scenes/README.md"
+        )
+    return _validated(Cell, data, source)
+
+
+def parse_any_cell(data: Mapping[str, object], source: str) -> CellToCalibrate:
+    """Check a cell description of either kind (``schema``), as :func:`parse_cell`."""
+    if data.get("schema") == _MEASURED:
+        return _validated(MeasuredCell, data, source)
+    return _validated(Cell, data, source)
+
+
+def _validated(kind: type[_Kind], data: Mapping[str, object], source: str) -> _Kind:
     try:
-        return Cell.model_validate(data)
+        return kind.model_validate(data)
     except ValidationError as error:
         problems = _problems(error.errors(include_url=False))
         text = "; ".join(f"{key or 'the cell'}: {what}" for key, what in problems)
@@ -369,6 +437,8 @@ def _meant(location: tuple[int | str, ...]) -> str:
     names = [part for part in location[:-1] if isinstance(part, str)]
     section = _SECTIONS[names[-1]] if names else Cell
     known = [field.alias or name for name, field in section.model_fields.items()]
+    # What the other kind of cell would have there was not meant.
+    known = [name for name in known if name != location[-1]]
     return next(iter(get_close_matches(str(location[-1]), known, n=1)), "")
 
 

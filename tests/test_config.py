@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from handeye_tri.config import Cell, RigConfig, parse_cell
+from handeye_tri.config import Cell, RigConfig, parse_any_cell, parse_cell
 from handeye_tri.errors import InputError
 from handeye_tri.triangle import AXES
 
@@ -310,3 +310,52 @@ def test_a_long_value_is_cut(cell: Description) -> None:
     with pytest.raises(InputError) as raised:
         parse_cell(cell, "cell.yaml")
     assert len(str(raised.value)) < 200
+
+
+MEASURED = {
+    "schema": "handeye_tri.measured_cell/1",
+    "name": "bench",
+    "arm": {"repeatability_mm": 0.05, "repeatability_deg": 0.01},
+    "rig": {
+        "axis": "normal",
+        "side_ab_mm": 130.0,
+        "side_ac_mm": 120.0,
+        "angle_deg": 65.0,
+        "marker_radii_mm": [8.0, 8.0, 8.0],
+        "marker_colours": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        "identity": "colour",
+    },
+    "cameras": [
+        {"name": "left", "image_size_px": [640, 480]},
+        {"name": "right", "image_size_px": [640, 480], "estimate": {"skew": False}},
+    ],
+}
+
+
+def test_a_measured_cell_needs_no_model_and_no_nominal_cameras():
+    measured = parse_any_cell(MEASURED, "bench.yaml")
+    assert measured.rig.triangle.side_ab == pytest.approx(0.13)
+    assert measured.repeatability.translation == pytest.approx(5e-5)
+    assert [camera.info.skew for camera in measured.cameras] == [True, False]
+    assert measured.track_limit_mm == 1.0
+    assert measured.plan.min_plane_spread_deg == 20
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("arm", "repeatability_mm"), None, "arm.repeatability_mm"),
+        (("arm", "model"), "hp3_like.xml", "arm.model: this key is not known here"),
+        (("rig", "ahead_mm"), 90.0, "rig.ahead_mm: this key is not known here"),
+        (("rig", "side_ac_mm"), 15.0, "touch each other"),
+    ],
+)
+def test_a_measured_cell_states_what_counts_and_no_more(path, value, message):
+    section = {**MEASURED[path[0]], path[1]: value}
+    with pytest.raises(InputError, match=message):
+        parse_any_cell({**MEASURED, path[0]: section}, "bench.yaml")
+
+
+def test_a_measured_cell_cannot_be_planned_or_simulated():
+    with pytest.raises(InputError, match="neither planned nor simulated"):
+        parse_cell(MEASURED, "bench.yaml")

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 def _work(folder: SessionFolder, verbs: tuple[str, ...], *, again: bool) -> Run:
-    from handeye_tri.pipeline import STAGES, Run, execute
+    from handeye_tri.pipeline import Run, execute, stages_of
 
     cap_threads()
     progress = StderrProgress()
     run = Run(folder, progress)
     try:
         with folder.locked():
-            execute(run, STAGES, verbs, again=again)
+            execute(run, stages_of(run), verbs, again=again)
     finally:
         progress.close()
     return run
@@ -153,7 +153,7 @@ def check(session: Path, as_json: bool) -> None:
     """
     import json
 
-    from handeye_tri.pipeline import STAGES, Run
+    from handeye_tri.pipeline import Run, stages_of
     from handeye_tri.pipeline.checking import check_session
     from handeye_tri.storage import SessionFolder
     from handeye_tri.summary import check_text
@@ -162,7 +162,8 @@ def check(session: Path, as_json: bool) -> None:
     progress = StderrProgress()
     progress.begin(1, 1, "check")
     try:
-        checked = check_session(Run(SessionFolder.open(session), progress), STAGES)
+        run = Run(SessionFolder.open(session), progress)
+        checked = check_session(run, stages_of(run))
     finally:
         progress.close()
     click.echo(

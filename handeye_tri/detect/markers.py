@@ -11,7 +11,7 @@ from handeye_tri.errors import InputError
 from handeye_tri.records import Floats, locked
 
 if TYPE_CHECKING:
-    from handeye_tri.config import RigConfig
+    from handeye_tri.config import TriangleConfig
 
 Identity = Literal["colour", "radius"]
 Reason = Literal[
@@ -98,7 +98,7 @@ class MarkerSpec:
             )
 
     @classmethod
-    def from_rig(cls, rig: RigConfig) -> MarkerSpec:
+    def from_rig(cls, rig: TriangleConfig) -> MarkerSpec:
         """The markers of a cell's rig.
 
         Raises:

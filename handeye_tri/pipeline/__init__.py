@@ -5,7 +5,7 @@ A stage whose inputs and outputs are unchanged is not done again.
 
 from handeye_tri.pipeline.execution import Stage, execute
 from handeye_tri.pipeline.run import NullProgress, Progress, Run, start
-from handeye_tri.pipeline.stages import STAGES, VERBS
+from handeye_tri.pipeline.stages import STAGES, VERBS, stages_of
 
 __all__ = [
     "STAGES",
@@ -15,5 +15,6 @@ __all__ = [
     "Run",
     "Stage",
     "execute",
+    "stages_of",
     "start",
 ]

@@ -45,7 +45,9 @@ def inputs_of(run: Run, stage: Stage) -> str:
             "half_turns": header["half_turns"],
             "cell": {key: header["cell"].get(key) for key in stage.cell_keys},
             **{key: header.get(key) for key in stage.header_keys},
-            "model": storage.sha256(run.model_path) if stage.name == "plan" else "",
+            "model": storage.sha256(run.model_path)
+            if stage.name == "plan" and header["model_file"]
+            else "",
             "after": {name: run.folder.outputs(name) for name in stage.after},
         }
     )
@@ -66,6 +68,12 @@ def execute(
         StorageError: an earlier stage's files are missing or damaged.
         HandEyeError: what the stage itself raises.
     """
+    absent = [verb for verb in verbs if all(s.verb != verb for s in stages.values())]
+    if absent:
+        raise StorageError(
+            f"{run.folder.path}: this session was imported, there is nothing to "
+            f"{absent[0]}; go on with: handeye-tri detect {run.folder.path}"
+        )
     for stage in stages.values():
         if stage.verb in verbs and stage.preflight is not None:
             state, _ = run.folder.state(stage.name, inputs_of(run, stage))

@@ -21,7 +21,7 @@ from handeye_tri.pipeline.run import (
     PLAN_SCHEMA,
     Run,
 )
-from handeye_tri.pipeline.stages import STAGES
+from handeye_tri.pipeline.stages import stages_of
 from handeye_tri.records import CameraCalibration
 from handeye_tri.se3 import se3_inverse
 from handeye_tri.storage import codec
@@ -48,7 +48,8 @@ def verdict_of(run: Run) -> str:
     Raises:
         StorageError: it is not evaluated, or something changed since.
     """
-    require(run, STAGES, STAGES["evaluate"])
+    stages = stages_of(run)
+    require(run, stages, stages["evaluate"])
     return str(run.evaluation()["verdict"])
 
 
@@ -188,13 +189,14 @@ def _bag(run: Run, results: Results) -> exchange.Bag:
     }
 
     def photograph(camera: str, station: int) -> bytes | None:
-        path = run.folder.file(run.image_name(camera, station))
-        return storage.read_bytes(path) if path.is_file() else None
+        if not run.was_taken(camera, station):
+            return None
+        return storage.read_bytes(run.folder.file(run.image_name(camera, station)))
 
     bag = exchange.Bag(results, json.dumps(about, ensure_ascii=False), photograph)
-    joints = np.array([station.joints for station in stations])
-    if joints.size == 0:
+    if not run.has_robot:
         return bag
+    joints = np.array([station.joints for station in stations])
     names = exchange.link_names(
         run.mechanism, results.frames.base, results.frames.flange
     )

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from handeye_tri.arm import Arm
-    from handeye_tri.config import Cell
+    from handeye_tri.config import Cell, CellToCalibrate
     from handeye_tri.mechanism import Mechanism
 
 PLAN_SCHEMA = "handeye_tri.plan/1"
@@ -121,9 +121,32 @@ class Run:
         self.progress = progress
 
     @cached_property
-    def cell(self) -> Cell:
-        """The cell's description."""
+    def cell(self) -> CellToCalibrate:
+        """The cell's description, as far as calibration needs it."""
         return self.folder.cell
+
+    @property
+    def designed_cell(self) -> Cell:
+        """The whole description.
+
+        Raises:
+            InputError: the session is of a real cell that nobody designed here.
+        """
+        from handeye_tri.config import Cell
+
+        if not isinstance(self.cell, Cell):
+            raise InputError(
+                f"{self.folder.path}: this session's cell was measured and has neither "
+                "a robot model nor nominal cameras; describe it with "
+                "schema: handeye_tri.cell/1 for that (scenes/README.md)"
+            )
+        return self.cell
+
+    @property
+    def has_robot(self) -> bool:
+        """Whether there is a model of the robot and joints of every station."""
+        named = bool(self.folder.header["model_file"])
+        return named and all(len(station.joints) for station in self.plan().stations)
 
     @property
     def seed(self) -> int:
@@ -151,7 +174,7 @@ class Run:
         """The compiled cell."""
         from handeye_tri.simulate import compile_mechanism
 
-        return compile_mechanism(self.cell, self.model_path)
+        return compile_mechanism(self.designed_cell, self.model_path)
 
     @cached_property
     def arm(self) -> Arm:
@@ -192,8 +215,16 @@ class Run:
         """Name of the file of one view."""
         return f"images/{camera}_{station:03d}.png"
 
+    def was_taken(self, camera: str, station: int) -> bool:
+        """Whether there is such a view; a real camera may have missed a station."""
+        return self.image_name(camera, station) in self.folder.outputs("simulate")
+
     def image(self, camera: str, station: int) -> NDArray[np.uint8]:
-        """One view, read back."""
+        """One view, read back; black where it was not taken."""
+        if not self.was_taken(camera, station):
+            sizes = {c.name: c.image_size_px for c in self.cell.cameras}
+            width, height = sizes[camera]
+            return np.zeros((height, width, 3), dtype=np.uint8)
         return storage.read_image(self.folder.file(self.image_name(camera, station)))
 
     def evaluation(self) -> dict[str, Any]:

@@ -6,10 +6,13 @@ numbers whether it ran in one go or was taken up again.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from handeye_tri import storage
-from handeye_tri.errors import InputError
+from handeye_tri.errors import InputError, StorageError
+from handeye_tri.pipeline.drawn_robot import drawn_robot
 from handeye_tri.pipeline.evaluation import evaluate, judged_track
 from handeye_tri.pipeline.execution import Stage
 from handeye_tri.pipeline.run import (
@@ -26,7 +29,7 @@ def _plan(run: Run) -> tuple[list[str], str]:
     from handeye_tri.plan import plan_motions
 
     plan = plan_motions(
-        run.cell,
+        run.designed_cell,
         run.arm,
         run.seed,
         half_turns=int(run.folder.header["half_turns"]),
@@ -57,7 +60,7 @@ def _simulate(run: Run) -> tuple[list[str], str]:
 
     plan = run.plan()
     joints = simulate.execute(run.arm, plan, run.cell.repeatability, run.seed)
-    truth = simulate.ground_truth(run.cell, run.arm, joints)
+    truth = simulate.ground_truth(run.designed_cell, run.arm, joints)
     storage.write_json(
         run.folder.file("truth.json"),
         {"schema": TRUTH_SCHEMA, **codec.truth_to_json(truth, joints)},
@@ -83,7 +86,7 @@ def _simulate(run: Run) -> tuple[list[str], str]:
     with ThreadPoolExecutor(1) as writer:
         pending = []
         for i, j, image in simulate.render_views(
-            run.cell, run.model_path, joints, run.seed, missing
+            run.designed_cell, run.model_path, joints, run.seed, missing
         ):
             path = run.folder.file(run.image_name(names[i], j))
             pending.append(writer.submit(storage.write_image, path, image))
@@ -107,6 +110,8 @@ def _detect(run: Run) -> tuple[list[str], str]:
     for i, camera in enumerate(cameras):
         for j in range(stations):
             name = run.image_name(camera.name, j)
+            if not run.was_taken(camera.name, j):
+                continue
             image = run.image(camera.name, j)
             if image.shape[1::-1] != camera.image_size_px:
                 raise InputError(
@@ -175,14 +180,14 @@ def _report(run: Run) -> tuple[list[str], str]:
     session, hand_eye, evaluation = run.session(), run.hand_eye(), run.evaluation()
     track = judged_track(run, session, hand_eye).track
     truth = run.truth()
-    joints = np.array([station.joints for station in session.stations])
+    drawn = drawn_robot(run, session, hand_eye)
     recording = run.folder.file("replay.rrd")
     replay.write_recording(
         recording,
         name=run.cell.name,
-        mechanism=run.mechanism,
-        world_from_body=run.arm.body_poses(joints),
-        base_from_world=run.arm.base_from_world,
+        mechanism=drawn.mechanism,
+        world_from_body=drawn.world_from_body,
+        base_from_world=drawn.base_from_world,
         session=session,
         photograph=run.image,
         calibration=hand_eye,
@@ -200,7 +205,9 @@ def _report(run: Run) -> tuple[list[str], str]:
         origin=Origin(
             cell=run.cell.name,
             seed=run.seed,
-            command=f"handeye-tri run {header['cell_file']} -o {run.folder.path} "
+            command=str(header["source"]["command"])
+            if "source" in header
+            else f"handeye-tri run {header['cell_file']} -o {run.folder.path} "
             f"--seed {run.seed} --half-turns {header['half_turns']}",
             software=header["software"],
             files={
@@ -215,8 +222,8 @@ def _report(run: Run) -> tuple[list[str], str]:
     )
     storage.write_bytes(run.folder.file("report.html"), page.encode())
     return ["report.html", "replay.rrd"], (
-        f"{len(page) / 1e3:.0f} kB page; recording of {len(joints)} stations, "
-        f"{recording.stat().st_size / 1e6:.1f} MB"
+        f"{len(page) / 1e3:.0f} kB page; recording of {len(session.stations)} "
+        f"stations, {recording.stat().st_size / 1e6:.1f} MB"
     )
 
 
@@ -265,4 +272,25 @@ STAGES = {
         ),
     )
 }
+
+
+def _not_again(run: Run) -> tuple[list[str], str]:
+    raise StorageError(
+        f"{run.folder.path}: what was imported is missing or damaged; import it again "
+        f"into another folder: {run.folder.header['source']['command']}"
+    )
+
+
+# What stands for the first two stages where their files come from a real robot.
+_IMPORTED = {
+    name: replace(STAGES[name], verb="import", run=_not_again, preflight=None)
+    for name in ("plan", "simulate")
+}
+
+
+def stages_of(run: Run) -> dict[str, Stage]:
+    """The stages of a session: all, or those of an imported one."""
+    return {**STAGES, **_IMPORTED} if run.folder.header.get("source") else STAGES
+
+
 VERBS = tuple(dict.fromkeys(stage.verb for stage in STAGES.values()))

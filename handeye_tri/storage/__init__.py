@@ -1,6 +1,12 @@
 """Sessions, results and cell descriptions on disk; the only reader and writer."""
 
-from handeye_tri.storage.cells import find_cell, find_model, read_cell, shipped
+from handeye_tri.storage.cells import (
+    find_cell,
+    find_model,
+    read_any_cell,
+    read_cell,
+    shipped,
+)
 from handeye_tri.storage.files import (
     read_arrays,
     read_bytes,
@@ -27,6 +33,7 @@ __all__ = [
     "find_cell",
     "find_model",
     "fingerprint",
+    "read_any_cell",
     "read_arrays",
     "read_bytes",
     "read_cell",

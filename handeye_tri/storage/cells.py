@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from handeye_tri.config import Cell, parse_cell
+from handeye_tri.config import Cell, CellToCalibrate, parse_any_cell, parse_cell
 from handeye_tri.errors import InputError
 from handeye_tri.storage.files import read_bytes
 
@@ -38,11 +39,24 @@ def find_cell(name_or_path: str) -> Path:
 
 
 def read_cell(path: Path) -> Cell:
-    """Read and check a cell description.
+    """Read and check the description of a cell to plan and simulate.
 
     Raises:
         InputError: not YAML, an unknown key, a wrong unit, an impossible value.
     """
+    return parse_cell(_mapping(path), str(path))
+
+
+def read_any_cell(path: Path) -> CellToCalibrate:
+    """Read and check a cell description of either kind.
+
+    Raises:
+        InputError: as :func:`read_cell`.
+    """
+    return parse_any_cell(_mapping(path), str(path))
+
+
+def _mapping(path: Path) -> dict[str, Any]:
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
@@ -55,7 +69,7 @@ def read_cell(path: Path) -> Cell:
         raise InputError(f"{path}: this is not valid YAML: {detail}") from None
     if not isinstance(data, dict):
         raise InputError(f"{path}: a cell description is a mapping of keys")
-    return parse_cell(data, str(path))
+    return data
 
 
 def find_model(cell: Cell, cell_path: Path) -> Path:

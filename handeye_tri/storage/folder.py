@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from handeye_tri.config import Cell, parse_cell
+from handeye_tri.config import CellToCalibrate, parse_any_cell
 from handeye_tri.errors import HandEyeError, StorageError
 from handeye_tri.storage.files import read_json, sha256, write_json
 
@@ -104,9 +104,9 @@ class SessionFolder:
         return cls(path, header)
 
     @property
-    def cell(self) -> Cell:
+    def cell(self) -> CellToCalibrate:
         """The cell that the session is about."""
-        return parse_cell(self.header["cell"], str(self.path / "session.json"))
+        return parse_any_cell(self.header["cell"], str(self.path / "session.json"))
 
     def file(self, name: str) -> Path:
         """Path of a file of the session; it cannot leave the folder.
