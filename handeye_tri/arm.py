@@ -42,6 +42,7 @@ class Arm:
         lower: Lower limits, shape (q,), rad or m; -inf where there is none.
         upper: Upper limits, shape (q,), rad or m; inf where there is none.
         home: The model's reference configuration, within the limits, shape (q,).
+        speed: Speed limits, shape (q,), rad/s or m/s; inf where the model has none.
         base_from_world: The base that poses refer to.
         clearance: Solids nearer than this to each other count as colliding, m.
         on_flange: Names of the solids that ride with the flange.
@@ -69,6 +70,7 @@ class Arm:
         self.lower = np.array([joint.lower for joint in joints])
         self.upper = np.array([joint.upper for joint in joints])
         self.home = np.clip([j.reference for j in joints], self.lower, self.upper)
+        self.speed = np.array([joint.speed for joint in joints])
         # Per body: the Pinocchio joint that carries it, and its pose there.
         self._carrier: list[int] = []
         self._carried: list[SE3] = []

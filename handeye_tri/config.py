@@ -54,6 +54,9 @@ class ArmConfig(RobotAccuracy):
     position_m: Point = (0.0, 0.0, 0.0)
     repeatability_mm: NotNegative = 0.03
     repeatability_deg: NotNegative = 0.005
+    acceleration_time_s: Positive = Field(
+        0.3, description="what a joint takes from rest to its full speed"
+    )
 
 
 class TriangleConfig(_Model):

@@ -15,8 +15,8 @@ from handeye_tri.plan.poses import HALF_TURN, View
 Floats = NDArray[np.float64]
 
 # Poses drawn at once, and at most, until enough pass.
-_BATCH = 120
-_MOST_POSES = 3600
+_BATCH = 400
+_MOST_POSES = 12000
 # A cell in which none of this many poses passes has no plan.
 _HOPELESS = 1200
 # Inverse solutions of a pose that are tried, nearest to those before first.
@@ -31,8 +31,25 @@ _SAME_POSE = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Prospect:
+    """A place that the cameras see and the arm reaches; solids are not looked at.
+
+    Attributes:
+        base_from_flange: Shape (s, 4, 4), metres: s = 2 before and after a
+            half-turn, else 1.
+        before: Joints by solution, shape (k, q), rad or m.
+        after: For each of them those after the half-turn, shapes (t, q); empty
+            for a single station.
+    """
+
+    base_from_flange: Floats
+    before: Floats
+    after: tuple[Floats, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A place for one station, or for the two of a half-turn.
+    """A place for one station, or for the two of a half-turn, free of solids.
 
     Attributes:
         joints: Shape (s, q), rad or m: s = 2 before and after a half-turn, else 1.
@@ -68,15 +85,12 @@ class CandidateSearch:
         self.rejected: Counter[str] = Counter()
         self.drawn = 0
 
-    def find(
-        self, wanted: int, *, turns: bool, progress: Callable[[int], None] | None = None
-    ) -> list[Candidate]:
+    def find(self, wanted: int, *, turns: bool) -> list[Candidate]:
         """Search until enough candidates are found or hope is lost.
 
         Args:
             wanted: How many.
             turns: Whether a candidate is a half-turn (else one station).
-            progress: Told how many there are, after each one.
 
         Returns:
             Up to ``wanted`` candidates, in the order drawn.
@@ -85,25 +99,37 @@ class CandidateSearch:
         while len(found) < wanted and self.drawn < _MOST_POSES:
             if not found and self.drawn >= _HOPELESS:
                 break
-            for before, after in self._solved(turns):
-                candidate = self._first_free(before, after)
-                if candidate is None:
-                    continue
-                self._anchor = candidate.joints[-1]
-                found.append(candidate)
-                if progress is not None:
-                    progress(len(found))
+            for prospect in self._solved(turns):
+                candidate = self.first_free(prospect)
+                if candidate is not None:
+                    found.append(candidate)
                 if len(found) == wanted:
                     break
         return found
 
-    def _solved(self, turns: bool) -> list[tuple[Floats, list[Floats]]]:
-        """Joints of a batch of poses that pass the checks without solids.
+    def prospects(
+        self, wanted: int, progress: Callable[[int], None] | None = None
+    ) -> list[Prospect]:
+        """Half-turns that the cameras see and the arm reaches.
+
+        Args:
+            wanted: How many.
+            progress: Told how many there are, after each batch.
 
         Returns:
-            Per pose its solutions (s, q), and for each of them those after the
-            half-turn, shape (t, q); without turns t = 0.
+            Up to ``wanted``, in the order drawn.
         """
+        found: list[Prospect] = []
+        while len(found) < wanted and self.drawn < _MOST_POSES:
+            if not found and self.drawn >= _HOPELESS:
+                break
+            found += self._solved(turns=True)
+            if progress is not None:
+                progress(min(len(found), wanted))
+        return found[:wanted]
+
+    def _solved(self, turns: bool) -> list[Prospect]:
+        """Those of a batch of poses that pass the checks without solids."""
         view, arm = self._view, self._arm
         poses = view.draw(self._rng, _BATCH)
         self.drawn += len(poses)
@@ -117,17 +143,23 @@ class CandidateSearch:
             return []
         targets = arm.base_from_world.matrix @ poses
         before = arm.inverse(targets, self._rng, starts=_STARTS)
-        solved = []
-        for joints, beyond in zip(before.joints, before.beyond_limits, strict=True):
-            if len(joints) == 0:
-                self.rejected["limits" if beyond else "reach"] += 1
-            else:
-                solved.append(joints)
+        solved = np.array([len(joints) > 0 for joints in before.joints], dtype=bool)
+        beyond = int((~solved & before.beyond_limits).sum())
+        self.rejected["limits"] += beyond
+        self.rejected["reach"] += int((~solved).sum()) - beyond
+        places = np.flatnonzero(solved)
+        joints = [before.joints[k] for k in places]
         if not turns:
-            return [(joints, []) for joints in solved]
-        pairs = list(zip(solved, self._turned(solved), strict=True))
-        possible = [pair for pair in pairs if any(len(after) for after in pair[1])]
-        self.rejected["half_turn"] += len(pairs) - len(possible)
+            return [
+                Prospect(targets[k][None], q, ())
+                for k, q in zip(places, joints, strict=True)
+            ]
+        possible = [
+            Prospect(np.stack([targets[k], targets[k] @ HALF_TURN]), q, tuple(after))
+            for k, q, after in zip(places, joints, self._turned(joints), strict=True)
+            if any(len(ends) for ends in after)
+        ]
+        self.rejected["half_turn"] += len(places) - len(possible)
         return possible
 
     def _turned(self, poses: list[Floats]) -> list[list[Floats]]:
@@ -163,19 +195,20 @@ class CandidateSearch:
             for turned, keep in zip(tries, usable, strict=True)
         ]
 
-    def _first_free(self, before: Floats, after: list[Floats]) -> Candidate | None:
-        """The first solution that no solid forbids; else count what forbade it."""
+    def first_free(self, prospect: Prospect) -> Candidate | None:
+        """The first solution that no solid forbids; else count what forbade it.
+
+        Solutions nearest to the last free one come first.
+        """
+        before = prospect.before
         order = np.argsort(np.linalg.norm(before - self._anchor, axis=1))
         reasons: list[str] = []
         for k in order[:_SOLUTIONS]:
-            ends = after[k] if after else before[k : k + 1]
-            for end in ends:
-                joints = np.stack([before[k], end]) if after else end[None]
+            for joints in _joints(prospect, k):
                 reason = self._obstacle(joints)
                 if reason is None:
-                    poses = self._arm.forward(joints)
-                    world = self._arm.base_from_world.inverse().matrix @ poses[:1]
-                    return Candidate(joints, poses, self._view.normals(world)[0])
+                    self._anchor = joints[-1]
+                    return self._candidate(prospect, joints)
                 reasons.append(reason)
                 if reason == _BY_RIG:
                     # The rig hides its own marker: so it does in every solution.
@@ -185,6 +218,20 @@ class CandidateSearch:
         checks = ("half_turn", "occlusion", "collision", "turn_path")
         self.rejected[max(reasons, key=checks.index, default="half_turn")] += 1
         return None
+
+    def all_free(self, prospect: Prospect) -> list[Candidate]:
+        """Every solution that no solid forbids."""
+        return [
+            self._candidate(prospect, joints)
+            for k in range(len(prospect.before))
+            for joints in _joints(prospect, k)
+            if self._obstacle(joints) is None
+        ]
+
+    def _candidate(self, prospect: Prospect, joints: Floats) -> Candidate:
+        world = self._arm.base_from_world.inverse().matrix
+        normal = self._view.normals(world @ prospect.base_from_flange[:1])[0]
+        return Candidate(joints, self._arm.forward(joints), normal)
 
     def _obstacle(self, joints: Floats) -> str | None:
         """Name of the check that a candidate's joints (s, q) fail, or None."""
@@ -200,3 +247,11 @@ class CandidateSearch:
         if len(joints) == 2 and arm.path_collision(*joints) is not None:
             return "turn_path"
         return None
+
+
+def _joints(prospect: Prospect, solution: int) -> list[Floats]:
+    """Joints (s, q) of a solution: one for each way to turn."""
+    start = prospect.before[solution]
+    if not prospect.after:
+        return [start[None]]
+    return [np.stack([start, end]) for end in prospect.after[solution]]

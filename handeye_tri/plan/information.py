@@ -9,6 +9,8 @@ adjustment that uses the pixels of all stations together.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +26,10 @@ Floats = NDArray[np.float64]
 _PRIOR_PIXELS = 1000.0
 _PRIOR_LENS = 1.0
 _PRIOR_MOTION = 1.0
+# Places in the workspace box that the track error is predicted at, and how many are
+# drawn to find that many which all cameras see.
+_PLACES = 300
+_DRAWN_PLACES = 3000
 
 
 class StationInformation:
@@ -50,6 +56,7 @@ class StationInformation:
             sigma_px: Of a detected centre, per axis, pixels.
         """
         self._view = view
+        self._base_from_world = base_from_world
         self._camera_from_base = se3_inverse(base_from_world @ view.world_from_camera)
         self._pose_covariance = repeatability.covariance
         self.sigma_px = sigma_px
@@ -125,6 +132,26 @@ class StationInformation:
         noise += self.sigma_px**2 * np.eye(a.shape[1])
         return np.asarray(a.swapaxes(-1, -2) @ np.linalg.solve(noise, a))
 
+    def of_half_turns(self, base_from_flange: Floats) -> Floats:
+        """Information of each half-turn, shape (n, p, p), of poses (n, 2, 4, 4)."""
+        each = self.of_stations(base_from_flange.reshape(-1, 4, 4))
+        size = len(self.labels)
+        return np.asarray(each.reshape(-1, 2, size, size).sum(axis=1))
+
+    @cached_property
+    def workspace_cost(self) -> Floats:
+        """What a covariance of the unknowns costs, shape (p, p).
+
+        ``trace(workspace_cost @ covariance)`` is the mean squared distance between
+        reported and observed markers that the calibration causes, in m^2, over
+        poses in the workspace box that all cameras see.
+        """
+        world = self._view.draw(np.random.default_rng(0), _DRAWN_PLACES)
+        world = world[self._view.tilt_allowed(world) & self._view.in_image(world)]
+        base = self._base_from_world @ world[:_PLACES]
+        track = self.track_derivatives(base).reshape(-1, len(self.labels))
+        return np.asarray(track.T @ track / (len(track) / 3))
+
     def track_derivatives(self, base_from_flange: Floats) -> Floats:
         """Observed less reported marker positions by the unknowns.
 
@@ -163,53 +190,3 @@ def _inverse(information: Floats) -> Floats:
     scaled = information * scale[..., :, None] * scale[..., None, :]
     inverse = np.linalg.inv(scaled) * scale[..., :, None] * scale[..., None, :]
     return np.asarray(0.5 * (inverse + inverse.swapaxes(-1, -2)))
-
-
-def choose(
-    information: Floats,
-    prior: Floats,
-    cost: Floats,
-    wanted: int,
-    exchanges: int = 3,
-) -> list[int]:
-    """The candidates that make ``trace(cost @ covariance)`` small.
-
-    Greedy, then Fedorov's exchange: replace one chosen candidate at a time as long
-    as that helps (Fedorov 1972, Theory of Optimal Experiments, ch. 3).
-
-    Args:
-        information: Of every candidate, shape (n, p, p).
-        prior: What is known before, shape (p, p).
-        cost: What a covariance costs, shape (p, p).
-        wanted: How many to choose, at most n.
-        exchanges: Upper limit of rounds.
-
-    Returns:
-        Indices, ascending.
-    """
-
-    def costs(total: Floats) -> Floats:
-        return np.asarray(np.einsum("ab,nba->n", cost, _inverse(total + information)))
-
-    chosen: list[int] = []
-    total = prior.copy()
-    for _ in range(wanted):
-        values = costs(total)
-        values[chosen] = np.inf
-        best = int(np.argmin(values))
-        chosen.append(best)
-        total = total + information[best]
-    for _ in range(exchanges):
-        changed = False
-        for place, current in enumerate(chosen):
-            without = total - information[current]
-            values = costs(without)
-            values[[c for c in chosen if c != current]] = np.inf
-            best = int(np.argmin(values))
-            if values[best] < values[current] * (1 - 1e-6):
-                chosen[place] = best
-                total = without + information[best]
-                changed = True
-        if not changed:
-            break
-    return sorted(chosen)

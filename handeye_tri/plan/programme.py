@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 from handeye_tri.arm import Arm
 from handeye_tri.config import Cell
 from handeye_tri.errors import InputError, NoPlanError
-from handeye_tri.plan.candidates import Candidate, CandidateSearch
-from handeye_tri.plan.information import StationInformation, choose
+from handeye_tri.plan.candidates import Candidate, CandidateSearch, Prospect
+from handeye_tri.plan.design import Design
+from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import View, plane_angles
+from handeye_tri.plan.selection import Selector
+from handeye_tri.plan.sequence import Stops, shortest_order, travel_time
 from handeye_tri.records import HalfTurn, Plan, Station
 from handeye_tri.se3 import SE3, so3_log
 
@@ -22,11 +25,14 @@ Progress = Callable[[int, int], None]
 
 # Detection's standard deviation per axis that predictions assume, pixels.
 EXPECTED_SIGMA_PX = 0.03
-# Half-turns to choose from, per half-turn wanted.
-_POOL = 8
-# Orders and selections that are tried before a cell is given up.
-_PATHS = 150
+# Half-turns to choose from, per half-turn wanted, and at most.
+_POOL = 90
+_LARGEST_POOL = 1000
+# Selections and, for each, paths that are tried before a cell is given up.
 _SELECTIONS = 6
+_PATHS = 400
+# Ways to reach a half-turn that the order may choose from.
+_OPTIONS = 6
 # Least spread of the rotation axes between stations over 3-D: the smallest over the
 # largest singular value of all axes.
 _MIN_AXIS_SPREAD = 0.1
@@ -64,7 +70,9 @@ def plan_motions(
     flange's z axis; successive half-turns' planes enclose at least
     ``plan.min_plane_spread_deg`` (Zhao, Liu and Zhang 2008, Proposition 1,
     doi:10.1109/TIP.2008.2005562); straight joint paths from station to station are
-    free. Among what passes, half-turns are chosen by predicted track error.
+    free. Among what passes, those half-turns are chosen that make the
+    calibration's part of the predicted track error over the workspace box least,
+    and the order that takes the least time.
 
     The certificate holds
 
@@ -76,8 +84,11 @@ def plan_motions(
       ``sigma.base_from_<camera>.translation_mm`` and ``.rotation_deg``: predicted
       standard deviations (for motions: of the three axes together),
     * ``track_calibration_rms_mm``: the calibration's part of the predicted distance
-      between reported and observed markers, over the evaluation stations,
-    * ``candidates``: half-turns that were chosen from.
+      between reported and observed markers, over the workspace box,
+    * ``relaxed_bound_mm``: no choice among the candidates has a lower one,
+    * ``candidates``: half-turns that were chosen from,
+    * ``cycle_time_s``: of all moves, from the arm's home, without what it stands
+      still at the stations.
 
     Args:
         cell: The cell.
@@ -113,155 +124,178 @@ class _Planner:
         self.seed = seed
         self.wanted = wanted
         self.view = View(cell)
-        self.pool_size = _POOL * wanted
+        self.model = StationInformation(
+            self.view,
+            arm.base_from_world.matrix,
+            cell.repeatability,
+            EXPECTED_SIGMA_PX,
+        )
+        self.pool_size = min(_POOL * wanted, _LARGEST_POOL)
         self.total = self.pool_size + wanted + cell.plan.evaluation_stations
         self.progress = progress
+        self.done = -1
         self.rejected: Counter[str] = Counter()
 
     def _done(self, done: int) -> None:
-        if self.progress is not None:
+        if self.progress is not None and done > self.done:
             self.progress(done, self.total)
+        self.done = max(done, self.done)
 
     def plan(self) -> Plan:
         """Search, choose, order, and add the evaluation stations."""
         search = CandidateSearch(
             self.view, self.arm, np.random.default_rng([self.seed, 0])
         )
-        pool = search.find(self.pool_size, turns=True, progress=self._done)
-        self.rejected += search.rejected
+        # Half of the work is in what comes after the pool.
+        pool = search.prospects(self.pool_size, progress=lambda n: self._done(n // 2))
+        self.rejected = search.rejected
         if len(pool) < self.wanted:
             raise self._no_plan(
                 search.drawn, f"{len(pool)} of {self.wanted} half-turns found"
             )
-        chosen = self._choose_and_order(pool)
+        chosen, bound = self._choose_and_order(pool, search)
         self._done(self.pool_size + self.wanted)
         evaluation = self._evaluation(chosen[-1].joints[-1])
+        plan = self._record(chosen, evaluation, bound, len(pool))
         self._done(self.total)
-        return self._record(chosen, evaluation, len(pool))
+        return plan
 
-    def _information(self) -> StationInformation:
-        return StationInformation(
-            self.view,
-            self.arm.base_from_world.matrix,
-            self.cell.repeatability,
-            EXPECTED_SIGMA_PX,
+    def _choose_and_order(
+        self, pool: Sequence[Prospect], search: CandidateSearch
+    ) -> tuple[list[Candidate], float]:
+        """The half-turns in their order, and the bound on their cost, m^2."""
+        checks = 0
+
+        def checked() -> None:
+            nonlocal checks
+            checks += 1
+            half = self.pool_size // 2
+            self._done(half + int((1 - np.exp(-checks / 200)) * half))
+
+        without_solids = Counter(self.rejected)
+        design = Design(
+            self.model.of_half_turns(np.array([p.base_from_flange for p in pool])),
+            self.model.prior,
+            self.model.workspace_cost,
         )
-
-    def _choose_and_order(self, pool: list[Candidate]) -> list[Candidate]:
-        model = self._information()
-        poses = np.array([c.base_from_flange for c in pool])
-        information = model.of_stations(poses.reshape(-1, 4, 4))
-        size = len(model.labels)
-        information = information.reshape(len(pool), 2, size, size).sum(axis=1)
-        track = model.track_derivatives(poses[:, 0]).reshape(-1, size)
-        cost = track.T @ track / (len(track) / 3)
-        usable = list(range(len(pool)))
+        selector = Selector(design, pool, search, self.wanted, checked)
+        if selector.probe() == 0:
+            by_solids = self.rejected - without_solids
+            raise self._no_plan(
+                search.drawn,
+                f"0 of {selector.checked} half-turns are free",
+                by_solids.most_common(1)[0][0],
+            )
+        selection = selector.select()
+        if selection is None:
+            by_solids = self.rejected - without_solids
+            raise self._no_plan(
+                search.drawn,
+                f"{selector.usable.sum()} of {self.wanted} half-turns are free",
+                by_solids.most_common(1)[0][0],
+            )
+        chosen: list[int] | None = selection.chosen
         for _ in range(_SELECTIONS):
-            if len(usable) < self.wanted:
+            if chosen is None:
                 break
-            picked = choose(information[usable], model.prior, cost, self.wanted)
-            selection = [usable[k] for k in picked]
-            order, stuck = self._order([pool[k] for k in selection])
-            if order is not None:
-                return order
-            usable.remove(selection[stuck])
+            order = self._order([search.all_free(pool[k]) for k in chosen])
+            if isinstance(order, list):
+                return order, selection.bound
+            chosen = selector.replace(chosen, chosen[order])
         most = "path" if self.rejected["path"] else "plane_spread"
         raise self._no_plan(
-            len(pool),
-            "no order of half-turns drives free from one to the next",
-            most,
+            len(pool), "no order of half-turns drives free from one to the next", most
         )
 
-    def _order(self, selection: list[Candidate]) -> tuple[list[Candidate] | None, int]:
-        """Order the half-turns, each in one of its two senses.
+    def _order(self, ways: list[list[Candidate]]) -> list[Candidate] | int:
+        """The half-turns in the order of least time, or the one that is in the way.
 
-        Depth first, nearest first; planes of successive half-turns spread enough
-        and the straight path between them free.
+        Planes of successive half-turns spread enough, and the straight path
+        between them is free; each is driven in one of its two senses.
 
-        Returns:
-            The half-turns in order, turned round where that helped, or None; and
-            the index of the one with the fewest successors.
+        Args:
+            ways: Free solutions of each half-turn.
         """
-        n = len(selection)
         least = np.radians(self.cell.plan.min_plane_spread_deg)
-        normals = np.array([c.normal for c in selection])
-        spread = plane_angles(normals[:, None], normals[None]) >= least
-        ends = np.array([c.joints[::step] for c in selection for step in (1, -1)])
-        nodes = range(2 * n)
-        distance = np.linalg.norm(ends[:, None, 1] - ends[None, :, 0], axis=-1)
-        free: dict[tuple[int, int], bool] = {}
-
-        def passable(a: int, b: int) -> bool:
-            if (a, b) not in free:
-                free[a, b] = self.arm.path_collision(ends[a, 1], ends[b, 0]) is None
-                self.rejected["path"] += not free[a, b]
-            return free[a, b]
-
-        def extend(path: list[int]) -> list[int] | None:
-            if len(path) == n:
-                return path
-            used = {node // 2 for node in path}
-            last = path[-1]
-            following = [
-                b for b in nodes if b // 2 not in used and spread[last // 2, b // 2]
-            ]
-            # Fewest successors first, so that none is left over; then the nearest.
-            rest = [b // 2 for b in following]
-            following.sort(
-                key=lambda b: (int(spread[b // 2][rest].sum()) // 2, distance[last, b])
-            )
-            for b in following:
-                if len(free) >= _PATHS:
-                    return None
-                if passable(last, b):
-                    result = extend([*path, b])
-                    if result is not None:
-                        return result
-            if not following:
-                self.rejected["plane_spread"] += 1
-            return None
-
-        scarce = int(np.argmin(spread.sum(axis=1)))
-        for start in (2 * scarce, 2 * scarce + 1):
-            path = extend([start])
-            if path is not None:
-                return [self._turned_round(selection[k // 2], k % 2) for k in path], 0
-        return None, scarce
-
-    @staticmethod
-    def _turned_round(candidate: Candidate, backward: int) -> Candidate:
-        if not backward:
-            return candidate
-        return Candidate(
-            candidate.joints[::-1], candidate.base_from_flange[::-1], candidate.normal
+        options = [
+            Candidate(way.joints[::s], way.base_from_flange[::s], way.normal)
+            for some in ways
+            for way in some[: _OPTIONS // 2]
+            for s in (1, -1)
+        ]
+        stop = np.array(
+            [k for k, some in enumerate(ways) for _ in some[: _OPTIONS // 2] * 2]
         )
+        begin = np.array([c.joints[0] for c in options])
+        end = np.array([c.joints[1] for c in options])
+        normals = np.array([c.normal for c in options])
+        spread = plane_angles(normals[:, None], normals[None]) >= least
+        times = np.where(spread, self._time(end[:, None], begin[None]), np.inf)
+        stops = Stops(stop, self._time(self.arm.home, begin), times)
+        order = self._drive(stops, begin, end)
+        if order is not None:
+            return [options[k] for k in order]
+        return int(np.argmin(np.bincount(stop, np.isfinite(times).sum(axis=1))))
+
+    def _time(self, start: Floats, end: Floats) -> Floats:
+        ramp = self.cell.arm.acceleration_time_s
+        return travel_time(start, end, self.arm.speed, ramp)
+
+    def _drive(self, stops: Stops, begin: Floats, end: Floats) -> list[int] | None:
+        """The order of least time whose straight paths are free, or None."""
+        known: set[tuple[int, int]] = set()
+        while len(known) < _PATHS:
+            order = shortest_order(stops)
+            if order is None:
+                self.rejected["plane_spread"] += 1
+                return None
+            blocked = False
+            for a, b in zip(order[:-1], order[1:], strict=True):
+                if (a, b) in known:
+                    continue
+                known.add((a, b))
+                if self.arm.path_collision(end[a], begin[b]) is not None:
+                    self.rejected["path"] += 1
+                    stops.times[a, b] = np.inf
+                    blocked = True
+            if not blocked:
+                return order
+        return None
 
     def _evaluation(self, start: Floats) -> list[Candidate]:
-        """Stations anywhere in the workspace, each reached on a free path."""
+        """Stations anywhere in the workspace, in the order of least time."""
         wanted = self.cell.plan.evaluation_stations
+        if wanted == 0:
+            return []
         search = CandidateSearch(
             self.view, self.arm, np.random.default_rng([self.seed, 1])
         )
-        chosen: list[Candidate] = []
-        last = start
-        # Some candidates more than wanted: a path may be blocked.
-        for candidate in search.find(3 * wanted, turns=False):
-            if self.arm.path_collision(last, candidate.joints[0]) is not None:
-                search.rejected["path"] += 1
-                continue
-            chosen.append(candidate)
-            last = candidate.joints[0]
-            if len(chosen) == wanted:
-                break
+        # Some more than wanted: a path may be blocked.
+        found = search.find(3 * wanted, turns=False)
         self.rejected += search.rejected
-        if len(chosen) < wanted:
-            raise self._no_plan(
-                search.drawn, f"{len(chosen)} of {wanted} evaluation stations found"
-            )
-        return chosen
+        reachable = [
+            c for c in found if self.arm.path_collision(start, c.joints[0]) is None
+        ]
+        self.rejected["path"] += len(found) - len(reachable)
+        while len(reachable) >= wanted:
+            some = reachable[:wanted]
+            joints = np.array([c.joints[0] for c in some])
+            times = self._time(joints[:, None], joints[None])
+            stops = Stops(np.arange(wanted), self._time(start, joints), times)
+            order = self._drive(stops, joints, joints)
+            if order is not None:
+                return [some[k] for k in order]
+            reachable.pop(int(np.argmin(np.isfinite(times).sum(axis=1))))
+        raise self._no_plan(
+            search.drawn, f"{len(reachable)} of {wanted} evaluation stations found"
+        )
 
     def _record(
-        self, chosen: list[Candidate], evaluation: list[Candidate], pool: int
+        self,
+        chosen: list[Candidate],
+        evaluation: list[Candidate],
+        bound: float,
+        pool: int,
     ) -> Plan:
         calibration = [
             Station(2 * k + step, "calibration", c.joints[step], SE3(pose))
@@ -275,8 +309,14 @@ class _Planner:
         turns = tuple(
             HalfTurn(2 * k, 2 * k + 1, self.cell.rig.axis) for k in range(len(chosen))
         )
-        certificate = self._certificate(chosen, evaluation)
+        certificate = self._certificate(chosen)
+        certificate["relaxed_bound_mm"] = float(1e3 * np.sqrt(bound))
         certificate["candidates"] = float(pool)
+        route = np.array(
+            [self.arm.home, *(s.joints for s in (*calibration, *held_out))]
+        )
+        times = self._time(route[:-1], route[1:])
+        certificate["cycle_time_s"] = float(times.sum())
         if certificate["axis_spread"] < _MIN_AXIS_SPREAD:
             self.rejected["axis_spread"] += 1
             raise self._no_plan(1, "the rotations do not span 3-D", "axis_spread")
@@ -288,9 +328,7 @@ class _Planner:
             self.seed,
         )
 
-    def _certificate(
-        self, chosen: list[Candidate], evaluation: list[Candidate]
-    ) -> dict[str, float]:
+    def _certificate(self, chosen: list[Candidate]) -> dict[str, float]:
         normals = np.array([c.normal for c in chosen])
         poses = np.concatenate([c.base_from_flange for c in chosen])
         certificate = {
@@ -300,7 +338,7 @@ class _Planner:
             "axis_spread": _axis_spread(poses[:, :3, :3]),
             "sigma_px": EXPECTED_SIGMA_PX,
         }
-        model = self._information()
+        model = self.model
         covariance = model.covariance(model.of_stations(poses).sum(axis=0))
         for label in covariance.labels:
             owner, quantity = label.rsplit(".", 1)
@@ -317,10 +355,8 @@ class _Planner:
             certificate[f"sigma.{name}.rotation_deg"] = float(
                 np.degrees(np.linalg.norm(turn))
             )
-        places = np.concatenate([c.base_from_flange for c in evaluation or chosen])
-        track = model.track_derivatives(places)
-        errors = np.einsum("nkap,pq,nkaq->nk", track, covariance.matrix, track)
-        certificate["track_calibration_rms_mm"] = float(1e3 * np.sqrt(errors.mean()))
+        error = float((self.model.workspace_cost * covariance.matrix).sum())
+        certificate["track_calibration_rms_mm"] = float(1e3 * np.sqrt(error))
         return certificate
 
     def _no_plan(self, drawn: int, what: str, check: str | None = None) -> NoPlanError:

@@ -7,7 +7,7 @@ import planning_scene as scene
 import pytest
 
 from handeye_tri.arm import Arm
-from handeye_tri.plan.candidates import CandidateSearch
+from handeye_tri.plan.candidates import _BATCH, CandidateSearch
 from handeye_tri.plan.poses import HALF_TURN, View
 
 
@@ -66,7 +66,7 @@ def test_every_drawn_pose_is_found_or_counted():
     assert all(len(c.joints) == 1 for c in found)
     # The last batch may not have been used up.
     left = one.drawn - sum(one.rejected.values()) - len(found)
-    assert 0 <= left < 120
+    assert 0 <= left < _BATCH
 
 
 def test_a_wrist_that_cannot_turn_is_named():
@@ -76,3 +76,21 @@ def test_a_wrist_that_cannot_turn_is_named():
     assert one.find(1, turns=True) == []
     assert one.rejected["half_turn"] + one.rejected["limits"] > 500
     assert one.rejected["half_turn"] > 100
+
+
+def test_prospects_become_the_same_half_turns_when_solids_allow_them():
+    one = search("hp3_stereo")
+    prospects = one.prospects(30)
+    assert len(prospects) == 30
+    arm = scene.arm_of("hp3_stereo")
+    free = [one.all_free(p) for p in prospects[:6]]
+    assert sum(map(len, free)) > 6
+    for prospect, ways in zip(prospects, free, strict=False):
+        first = one.first_free(prospect)
+        assert (first is None) == (not ways)
+        for way in ways:
+            np.testing.assert_allclose(
+                way.base_from_flange, prospect.base_from_flange, atol=1e-9
+            )
+            assert arm.path_collision(*way.joints) is None
+            assert ((way.joints >= arm.lower) & (way.joints <= arm.upper)).all()

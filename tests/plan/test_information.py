@@ -5,7 +5,7 @@ import planning_scene as scene
 import pytest
 
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera, triangulate
-from handeye_tri.plan.information import StationInformation, choose
+from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import View
 from handeye_tri.se3 import SE3, se3_exp, se3_inverse
 
@@ -163,23 +163,3 @@ def test_covariance_is_the_inverse_and_names_what_is_estimated(cell):
         asked |= {"skew"} if config.estimate.skew else set()
         own = {x.split(".")[1] for x in covariance.labels if x.startswith(config.name)}
         assert own == asked
-
-
-def test_choice_finds_the_best_set_where_all_can_be_tried():
-    rng = np.random.default_rng(3)
-    rows = rng.normal(size=(9, 2, 3))
-    information = rows.swapaxes(1, 2) @ rows
-    prior, cost = 1e-3 * np.eye(3), np.diag([1.0, 2.0, 3.0])
-    from itertools import combinations
-
-    def price(chosen):
-        return np.trace(
-            cost @ np.linalg.inv(prior + information[list(chosen)].sum(axis=0))
-        )
-
-    everything = {c: price(c) for c in combinations(range(9), 3)}
-    chosen = choose(information, prior, cost, 3)
-    assert len(set(chosen)) == 3
-    # Exchange ends in a local minimum: here within 2 % of the best of all 84.
-    assert price(chosen) <= 1.02 * min(everything.values())
-    assert price(chosen) < np.percentile(list(everything.values()), 5)

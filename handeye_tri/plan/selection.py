@@ -1,0 +1,140 @@
+"""Choosing half-turns by what they tell, looking at solids only where it matters.
+
+Whether a half-turn tells much costs microseconds, whether solids allow it costs
+milliseconds. So the best choice is made first and checked then, until everything
+that the choice and its bound rest on has passed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.plan.candidates import Candidate, CandidateSearch, Prospect
+from handeye_tri.plan.design import Design
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+# Half-turns that are checked first, as drawn: where none of them passes, none will.
+_PROBE = 60
+# A fraction of a candidate that the bound rests on.
+_SUPPORT = 1e-3
+# Runners-up checked along with what is chosen, per half-turn wanted.
+_RUNNERS_UP = 3
+# Most half-turns that are checked; after that only those that passed count.
+_MOST_CHECKS = 600
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Selection:
+    """The half-turns that tell most.
+
+    Attributes:
+        chosen: Indices of prospects, ascending.
+        bound: No choice among the usable prospects costs less; see Design.
+    """
+
+    chosen: list[int]
+    bound: float
+
+
+class Selector:
+    """Chooses among prospects; remembers which of them solids allow.
+
+    Attributes:
+        usable: Prospects not known to be blocked nor replaced, shape (n,).
+        checked: How many were checked.
+    """
+
+    def __init__(
+        self,
+        design: Design,
+        prospects: Sequence[Prospect],
+        search: CandidateSearch,
+        wanted: int,
+        progress: Callable[[], None],
+    ) -> None:
+        """Start with nothing known.
+
+        Args:
+            design: Of the prospects.
+            prospects: At least ``wanted``.
+            search: Checks them and counts why they fail.
+            wanted: How many to choose.
+            progress: Called after each check.
+        """
+        self._design = design
+        self._prospects = prospects
+        self._search = search
+        self._wanted = wanted
+        self._progress = progress
+        self._found: dict[int, Candidate] = {}
+        self.usable = np.ones(len(prospects), dtype=bool)
+        self.checked = 0
+
+    def candidate(self, index: int) -> Candidate:
+        """A prospect that passed."""
+        return self._found[index]
+
+    def probe(self) -> int:
+        """Check the first prospects; returns how many passed."""
+        first = range(min(_PROBE, len(self._prospects)))
+        return sum(self._passes(index) for index in first)
+
+    def _passes(self, index: int) -> bool:
+        if index in self._found:
+            return True
+        if not self.usable[index]:
+            return False
+        candidate = self._search.first_free(self._prospects[index])
+        self.checked += 1
+        self._progress()
+        if candidate is None:
+            self.usable[index] = False
+            return False
+        self._found[index] = candidate
+        if self.checked == _MOST_CHECKS:
+            self.usable[:] = False
+            self.usable[list(self._found)] = True
+        return True
+
+    def select(self) -> Selection | None:
+        """The best choice, checked; None where too few prospects pass."""
+        while self.usable.sum() >= self._wanted:
+            relaxation = self._design.relax(self._wanted, self.usable)
+            chosen = self._rounded(relaxation.weights)
+            needed = np.flatnonzero(relaxation.weights > _SUPPORT)
+            ahead = self._design.ranked(relaxation.weights, self.usable)
+            ahead = ahead[: _RUNNERS_UP * self._wanted]
+            before = int(self.usable.sum())
+            blocked = [k for k in {*chosen, *needed} if not self._passes(int(k))]
+            if not blocked and before == int(self.usable.sum()):
+                return Selection(chosen, relaxation.bound)
+            for k in ahead:
+                self._passes(int(k))
+        return None
+
+    def replace(self, chosen: list[int], unwanted: int) -> list[int] | None:
+        """The best choice without one of a choice's half-turns, checked."""
+        self.usable[unwanted] = False
+        chosen = [k for k in chosen if k != unwanted]
+        while self.usable.sum() >= self._wanted:
+            weights = np.zeros(len(self._prospects))
+            weights[chosen] = 1.0
+            ranked = self._design.ranked(weights, self.usable)
+            missing = self._wanted - len(chosen)
+            chosen += [int(k) for k in ranked if k not in chosen][:missing]
+            chosen = self._design.exchange(chosen, self.usable)
+            free = [k for k in chosen if self._passes(k)]
+            if len(free) == self._wanted:
+                return chosen
+            chosen = [k for k in free if self.usable[k]]
+        return None
+
+    def _rounded(self, weights: Floats) -> list[int]:
+        start = np.argsort(-weights, kind="stable")[: self._wanted]
+        return self._design.exchange([int(k) for k in start], self.usable)

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from handeye_tri.plan.design import Design
+
+ALL = 9
+
+
+def problem(seed, n=ALL, size=3, rows=2):
+    """Random information of two rows each, in units many orders apart."""
+    rng = np.random.default_rng(seed)
+    units = np.array([1e3, 1.0, 1e-3, 10.0])[:size]
+    a = rng.normal(size=(n, rows, size)) / units
+    cost = rng.normal(size=(size, size)) / units
+    return a.swapaxes(1, 2) @ a, 1e-3 * np.diag(units**-2.0), cost.T @ cost
+
+
+def price(information, prior, cost, weights):
+    total = prior + np.tensordot(weights, information, 1)
+    return np.trace(cost @ np.linalg.inv(total))
+
+
+def ones(chosen, n=ALL):
+    return np.bincount(list(chosen), minlength=n).astype(float)
+
+
+def test_cost_is_that_of_the_covariance_in_any_units():
+    parts = problem(0)
+    design = Design(*parts)
+    weights = np.random.default_rng(1).random(ALL)
+    assert design.cost(weights) == pytest.approx(price(*parts, weights), rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_exchange_ends_near_the_best_of_all_choices(seed):
+    parts = problem(seed)
+    design, usable = Design(*parts), np.ones(ALL, dtype=bool)
+    everything = [price(*parts, ones(c)) for c in combinations(range(ALL), 3)]
+    relaxation = design.relax(3, usable)
+    start = [int(k) for k in np.argsort(-relaxation.weights)[:3]]
+    chosen = design.exchange(start, usable)
+    assert len(set(chosen)) == 3
+    now = price(*parts, ones(chosen))
+    assert now <= price(*parts, ones(start)) * (1 + 1e-9)
+    assert now <= 1.1 * min(everything)
+    # No exchange of one is left that helps.
+    for out in chosen:
+        for other in set(range(ALL)) - set(chosen):
+            swapped = ones([*(set(chosen) - {out}), other])
+            assert price(*parts, swapped) >= now * (1 - 1e-5)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), wanted=st.integers(1, 5), n=st.integers(6, 40))
+def test_the_bound_is_below_every_choice_and_close_to_the_fractional_one(
+    seed, wanted, n
+):
+    parts = problem(seed, n, 4)
+    design = Design(*parts)
+    relaxation = design.relax(wanted, np.ones(n, dtype=bool))
+    weights = relaxation.weights
+    assert weights.sum() == pytest.approx(wanted)
+    assert (weights >= 0).all()
+    assert (weights <= 1).all()
+    value = price(*parts, weights)
+    assert relaxation.bound <= value * (1 + 1e-9)
+    assert relaxation.bound >= value * (1 - 4e-3)
+    rng = np.random.default_rng(seed)
+    for _ in range(50):
+        chosen = rng.choice(n, wanted, replace=False)
+        assert price(*parts, ones(chosen, n)) >= relaxation.bound * (1 - 1e-9)
+
+
+def test_what_may_not_be_used_is_not_used_and_does_not_lower_the_bound():
+    parts = problem(4, 30, 4)
+    design, usable = Design(*parts), np.ones(30, dtype=bool)
+    free = design.relax(4, usable)
+    usable[free.weights > 0.1] = False
+    held = design.relax(4, usable)
+    assert (held.weights[~usable] == 0).all()
+    assert held.bound > free.bound
+    start = [int(k) for k in np.argsort(-held.weights)[:4]]
+    assert usable[design.exchange(start, usable)].all()
+    ranked = design.ranked(held.weights, usable)
+    assert sorted(ranked) == list(np.flatnonzero(usable))
+
+
+def test_as_many_candidates_as_wanted_leave_no_choice():
+    parts = problem(5, 4)
+    relaxation = Design(*parts).relax(4, np.ones(4, dtype=bool))
+    np.testing.assert_array_equal(relaxation.weights, np.ones(4))
+    assert relaxation.bound == pytest.approx(price(*parts, np.ones(4)))
