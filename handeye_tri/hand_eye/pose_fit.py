@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from handeye_tri.errors import ConvergenceError
 from handeye_tri.hand_eye.pose_iteration import ROUNDING, PoseIteration
 from handeye_tri.hand_eye.pose_model import PoseFit, PoseInput
+from handeye_tri.hand_eye.pose_noise import noise_shapes
 from handeye_tri.records import PoseNoise
+from handeye_tri.se3 import se3_inverse, se3_log
 
 Floats = NDArray[np.float64]
 
@@ -75,3 +77,22 @@ def fit_poses(
             "standard deviations); check that robot and observed poses belong together"
         )
     return state.result()
+
+
+def squared_distances(data: PoseInput, fit: PoseFit) -> Floats:
+    """Squared whitened residuals of all poses, used for a fit or not, shape (n,)."""
+    a, _ = data.robot(fit.offset)
+    camera = np.array(data.camera_from_target)
+    camera[:, :3, 3] *= fit.scale
+    b = se3_inverse(camera) if data.eye_in_hand else camera
+    e = se3_log(se3_inverse(a @ fit.x) @ (fit.z @ b))
+    # Rounding of exact data has no noise to be measured by.
+    e[:, :3][np.abs(e[:, :3]) < 1e-11 * fit.length] = 0.0
+    e[:, 3:][np.abs(e[:, 3:]) < 1e-11] = 0.0
+    shapes = noise_shapes(camera, fit.x, eye_in_hand=data.eye_in_hand)
+    variances = np.array([value**2 for _, value in fit.noise.items()])
+    covariance = np.einsum("k,knij->nij", variances, shapes)
+    scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    whitened = np.linalg.inv(covariance / (scale[:, :, None] * scale[:, None, :]))
+    e = e / scale
+    return np.asarray(np.einsum("ni,nij,nj->n", e, whitened, e))

@@ -14,11 +14,11 @@ from handeye_tri.hand_eye.clock import RobotTrack, correlate_clocks
 from handeye_tri.hand_eye.consensus import find_consensus
 from handeye_tri.hand_eye.few_axes import NO_TURN, start_from_few_axes, turns_are_few
 from handeye_tri.hand_eye.motions import check_motions, relative_motions
-from handeye_tri.hand_eye.pose_fit import fit_poses
+from handeye_tri.hand_eye.pose_fit import fit_poses, squared_distances
 from handeye_tri.hand_eye.pose_model import PoseFit, PoseInput
-from handeye_tri.hand_eye.pose_noise import noise_shapes
 from handeye_tri.hand_eye.pose_solution import PoseSolution, Undetermined
 from handeye_tri.hand_eye.relative import RelativeMethod, solve_axxb
+from handeye_tri.hand_eye.twin import require_no_twin
 from handeye_tri.records import Covariance, PosePairs, motion_labels
 from handeye_tri.se3 import SE3, se3_inverse, se3_log, so3_log
 
@@ -72,8 +72,9 @@ def solve_pose_pairs(
     Raises:
         InputError: unusable poses, fewer than three, an unknown method, or a
             ``shift_along_axis`` where none is open.
-        DegenerateMotionError: nothing moves; the clocks cannot be compared; a closed
-            form needs more than the poses have.
+        DegenerateMotionError: nothing moves; the clocks cannot be compared; two
+            solutions fit few half-turns alike; a closed form needs more than the
+            poses have.
         ConvergenceError: an iteration did not settle.
     """
     if method not in PAIR_METHODS:
@@ -92,6 +93,8 @@ def solve_pose_pairs(
     data, x, z, scale, used = _start(data, offset, seed)
     fit, used = _fit_and_drop(data, x, z, scale, offset, used, pairs)
     a, _ = data.robot(fit.offset)
+    if not data.few_axes:
+        require_no_twin(data, fit, used)
     undetermined = _name_directions(fit, a, pairs)
     if shift_along_axis is not None:
         shift = _only_shift(undetermined, shift_along_axis)
@@ -217,7 +220,7 @@ def _fit_and_drop(
     )
     for _ in range(_DROP_ROUNDS):
         seen.add(used.tobytes())
-        distances = _distances(data, fit)
+        distances = squared_distances(data, fit)
         within = distances < _limit(fit.tail, len(used))
         if within.tobytes() in seen or within.sum() < 3:
             break
@@ -231,25 +234,6 @@ def _fit_and_drop(
             noise=pairs.noise,
         )
     return fit, used
-
-
-def _distances(data: PoseInput, fit: PoseFit) -> Floats:
-    """Squared whitened residuals of all poses, shape (n,)."""
-    a, _ = data.robot(fit.offset)
-    camera = np.array(data.camera_from_target)
-    camera[:, :3, 3] *= fit.scale
-    b = se3_inverse(camera) if data.eye_in_hand else camera
-    e = se3_log(se3_inverse(a @ fit.x) @ (fit.z @ b))
-    # Rounding of exact data has no noise to be measured by.
-    e[:, :3][np.abs(e[:, :3]) < 1e-11 * fit.length] = 0.0
-    e[:, 3:][np.abs(e[:, 3:]) < 1e-11] = 0.0
-    shapes = noise_shapes(camera, fit.x, eye_in_hand=data.eye_in_hand)
-    variances = np.array([value**2 for _, value in fit.noise.items()])
-    covariance = np.einsum("k,knij->nij", variances, shapes)
-    scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    whitened = np.linalg.inv(covariance / (scale[:, :, None] * scale[:, None, :]))
-    e = e / scale
-    return np.asarray(np.einsum("ni,nij,nj->n", e, whitened, e))
 
 
 def _limit(tail: float, n: int) -> float:

@@ -215,6 +215,41 @@ def test_bad_input_is_named(change, keywords, message):
         solve_pose_pairs(pairs_of(*change(robot, observed)), **keywords)
 
 
+def half_turns(seed, axes, spread):
+    """Half-turns about axes, and turns about z, of a flange that moves by spread."""
+    rng = np.random.default_rng([9, seed])
+    x, z = random_poses(rng, 2, 0.1)
+    vectors = np.vstack(
+        [np.zeros(3), np.pi * np.array(axes), [(0, 0, 0.5)], [(0, 0, 2)]]
+    )
+    a = np.tile(np.eye(4), (len(vectors), 1, 1))
+    a[:, :3, :3] = so3_exp(vectors)
+    a[:, :3, 3] = spread * rng.standard_normal((len(a), 3))
+    a = random_poses(rng, 1)[0] @ a
+    noise = np.repeat([5e-4, 2e-3], 3) * rng.standard_normal((len(a), 6))
+    return a, se3_inverse(z) @ a @ x @ se3_exp(noise), x
+
+
+IN_ONE_PLANE = [(np.cos(t), np.sin(t), 0) for t in (0.3, 1.1, 1.9, 2.8)]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_half_turns_with_two_solutions_are_refused(seed):
+    a, b, _ = half_turns(seed, IN_ONE_PLANE, 0.0)
+    with pytest.raises(DegenerateMotionError, match="two solutions fit the 7 poses"):
+        solve_pose_pairs(pairs_of(a, b, "eye_to_hand"))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("axes", "spread"), [(IN_ONE_PLANE, 0.2), ([*IN_ONE_PLANE, (0.48, 0.64, 0.6)], 0.0)]
+)
+def test_positions_or_one_axis_out_of_plane_settle_half_turns(axes, spread, seed):
+    a, b, x = half_turns(seed, axes, spread)
+    found = solve_pose_pairs(pairs_of(a, b, "eye_to_hand"))
+    assert np.linalg.norm(found.x.translation - x[:3, 3]) < 5e-3
+
+
 def test_opencv_regression_near_180_degrees_is_exact():
     data = json.loads((need("opencv_24871") / "poses.json").read_text())
     found = solve_pose_pairs(pairs_of(data["gripper2base"], data["target2cam"]))
