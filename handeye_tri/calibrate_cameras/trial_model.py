@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.calibrate_cameras.trial_equations import Equations, Scratch
-from handeye_tri.camera import distort_jacobians
+from handeye_tri.camera import distort_components
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -209,20 +209,16 @@ class TrialModel:
         to_v: tuple[Floats | None, Floats] = (None, fy)
         by_lens: list[tuple[Floats, Floats]] = []
         if self.lens or state.lens.any():
-            bent, by_ideal, by_coefficient = distort_jacobians(
-                state.lens, np.stack([x, y], axis=-1)
+            bent = distort_components(state.lens, x, y)
+            x, y = bent.x, bent.y
+            to_u = (
+                fx * bent.x_by_x + skew * bent.x_by_y,
+                fx * bent.x_by_y + skew * bent.y_by_y,
             )
-            x, y = bent[..., 0], bent[..., 1]
-            to_u = tuple(
-                fx * by_ideal[..., 0, j] + skew * by_ideal[..., 1, j] for j in (0, 1)
-            )
-            to_v = tuple(fy * by_ideal[..., 1, j] for j in (0, 1))
+            to_v = (fy * bent.x_by_y, fy * bent.y_by_y)
             by_lens = [
-                (
-                    fx * by_coefficient[..., 0, k] + skew * by_coefficient[..., 1, k],
-                    fy * by_coefficient[..., 1, k],
-                )
-                for k in self.lens
+                (fx * along_x + skew * along_y, fy * along_y)
+                for along_x, along_y in (bent.by_lens[k] for k in self.lens)
             ]
         result = []
         for image, factors in enumerate((to_u, to_v)):

@@ -10,6 +10,7 @@ from handeye_tri.camera.lens import (
     Lens,
     LensModel,
     distort,
+    distort_components,
     distort_jacobians,
 )
 from handeye_tri.camera.pinhole import (
@@ -29,6 +30,7 @@ __all__ = [
     "PinholeCamera",
     "StereoRig",
     "distort",
+    "distort_components",
     "distort_jacobians",
     "project_jacobians",
     "triangulate",
