@@ -269,19 +269,3 @@ def test_cross_checks_agree_with_the_covariance(session):
     assert "Cross-validation, one half-turn left out" in (
         (session.parent / "stdout").read_text()
     )
-
-
-def test_check_judges_again_and_changes_nothing(session):
-    before, result = digests(session), evaluation(session)
-    done = command("check", session, "--json")
-    assert done.returncode == 0, done.stderr
-    checked = json.loads(done.stdout)
-    for key in ("verdict", "sentence", "nearest", "gates", "findings"):
-        assert checked[key] == result[key]
-    assert checked["track"]["positions"] == result["track"]["positions"]
-    assert checked["files_verified"] == len(before) - 1
-    assert checked["stale"] == []
-    text = command("check", session)
-    assert text.returncode == 0
-    assert text.stdout.startswith("VERDICT  PASS")
-    assert digests(session) == before
