@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handeye_tri.diagnose import Verdict, assess_pose_pairs
 from handeye_tri.errors import ConvergenceError
@@ -20,6 +22,15 @@ from handeye_tri.hand_eye import (
 from handeye_tri.records import Floats, PosePairs, motion_labels
 from handeye_tri.se3 import SE3, quaternion_wxyz, se3_adjoint
 from handeye_tri.summary import digits, motion_rows
+
+# Of a line of text; a table of long names may be wider.
+_WIDTH = 88
+# Poses whose residuals are listed at most, unless more were dropped.
+_LISTED = 60
+# Digits after the point that mean something: nanometres.
+_PLACES = 6
+# An open shift moves a coordinate by at least this share of its length, or leaves it.
+_MOVED = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,60 +129,102 @@ def _verdict_lines(solved: SolvedPairs) -> list[str]:
     verdict, solution = solved.verdict, solved.solution
     ran = [gate for gate in verdict.gates if gate.verdict != "not run"]
     met = [gate for gate in ran if gate.verdict != "bad"]
+    gates = verdict.gates
+    name, found, limit = (
+        max(len(getattr(gate, key)) for gate in gates) + 2
+        for key in ("name", "found", "limit")
+    )
     lines = [
         f"VERDICT  {verdict.outcome}      {len(solution.poses)} poses, "
         f"{solved.pairs.mounting.replace('_', '-')}, {len(met)} of {len(ran)} gates "
-        f"met, {len(verdict.gates) - len(ran)} not run",
-        f"  {verdict.sentence}",
-        f"  Nearest to failing: {verdict.nearest}.",
-        f"  {'gate':<32}{'found':<22}{'limit':<18}{'verdict':<10}blind to",
+        f"met, {len(gates) - len(ran)} not run",
+        *_wrapped(verdict.sentence),
+        *_wrapped(f"Nearest to failing: {verdict.nearest}."),
+        f"  {'gate':<{name + 3}}{'found':<{found}}{'limit':<{limit}}{'verdict':<10}"
+        "blind to",
     ]
-    for number, gate in enumerate(verdict.gates, 1):
+    for number, gate in enumerate(gates, 1):
         lines.append(
-            f"  {number:>2} {gate.name:<29}{gate.found:<22}{gate.limit:<18}"
-            f"{gate.verdict:<10}{gate.blind_to}"
+            f"  {number:>2} {gate.name:<{name}}{gate.found:<{found}}"
+            f"{gate.limit:<{limit}}{gate.verdict:<10}{gate.blind_to}"
         )
     for finding in verdict.findings:
-        lines += [
-            f"  {finding.code}: {finding.cause}; {finding.evidence}",
-            f"    Do: {finding.remedy}.",
-        ]
+        lines += _wrapped(f"{finding.code}: {finding.cause}; {finding.evidence}")
+        lines += _wrapped(f"Do: {finding.remedy}.", 4)
     lines += ["", "READINGS  of the same numbers, each solved (medians over all poses)"]
     for reading in solved.readings:
-        lines.append(
-            f"  {1e3 * reading.position:>10.3f} mm {np.degrees(reading.angle):>9.4f} "
-            f"deg   {reading.key}: {reading.meaning}"
+        numbers = (
+            f"{1e3 * reading.position:>12.3f} mm {np.degrees(reading.angle):>9.4f} deg"
         )
+        first, *rest = wrap(f"{reading.key}: {reading.meaning}", _WIDTH - 32)
+        lines.append(f"{numbers}   {first}")
+        lines += [" " * 34 + line for line in rest]
     return lines
+
+
+def _wrapped(text: str, indent: int = 2) -> list[str]:
+    """Lines of a sentence; what goes on is indented once more."""
+    return wrap(
+        text,
+        _WIDTH,
+        initial_indent=" " * indent,
+        subsequent_indent=" " * (indent + 2),
+        break_on_hyphens=False,
+    )
+
+
+def _open_rows(solution: PoseSolution, motion: SE3, name: str) -> NDArray[np.bool_]:
+    """Which of x, y, z, rx, ry, rz an undetermined direction changes, shape (6,)."""
+    rows = np.zeros(6, bool)
+    inverse = name not in solution.names
+    of_x = name.startswith("flange_from") or name.endswith("from_flange")
+    for one in solution.undetermined:
+        if one.kind == "shift":
+            axis = one.axis_in_flange if of_x else one.axis_in_base
+            # (R, t)^-1 has R' for its rotation and -R't for its place.
+            axis = motion.rotation @ axis if inverse else axis
+            rows[:3] |= np.abs(axis) > _MOVED
+        else:
+            rows |= np.repeat([True, one.kind == "turn"], 3)
+    return rows
+
+
+def _number(value: float, sigma: float) -> str:
+    """A value and its standard deviation in two columns."""
+    places = min(digits(sigma), _PLACES)
+    rounded = f"{sigma:.{places}f}" if sigma >= 10**-_PLACES else f"{sigma:.0e}"
+    return f"{value:>14.{places}f}{rounded:>14}"
 
 
 def _motion_lines(solved: SolvedPairs) -> list[str]:
     solution = solved.solution
     lines = [f"RESULT    by {solution.method}"]
-    lines.append(f"  {'':<30}{'value':>12}{'+- (1 sd)':>14}")
+    lines.append(f"  {'':<30}{'value':>14}{'+- (1 sd)':>14}")
     for name, motion, covariance in _motions(solution):
-        for row in motion_rows(name, motion, covariance, None):
-            places = digits(row["sigma"])
-            lines.append(
-                f"  {row['name'] + ', ' + row['unit']:<30}{row['value']:>12.{places}f}"
-                f"{row['sigma']:>14.{places}f}"
-            )
+        left = _open_rows(solution, motion, name)
+        rows = motion_rows(name, motion, covariance, None)
+        for row, is_open in zip(rows, left, strict=True):
+            number = _number(row["value"], row["sigma"])
+            if is_open:
+                number = f"{row['value']:>14.3f}{'OPEN':>14}"
+            lines.append(f"  {row['name'] + ', ' + row['unit']:<30}{number}")
         w, x, y, z = quaternion_wxyz(motion.rotation)
         lines.append(f"    quaternion w {w:.7f}  x {x:.7f}  y {y:.7f}  z {z:.7f}")
     if not solved.pairs.metric:
         sigma = solution.scale * solution.covariance.std("log_scale")
-        lines.append(
-            f"  {'metres per observed unit':<30}{solution.scale:>12.{digits(sigma)}f}"
-            f"{sigma:>14.{digits(sigma)}f}"
+        open_scale = any(one.kind == "scale" for one in solution.undetermined)
+        number = (
+            f"{solution.scale:>14.6g}{'OPEN':>14}"
+            if open_scale
+            else _number(solution.scale, sigma)
         )
+        lines.append(f"  {'metres per observed unit':<30}{number}")
     if solution.clock_offset is not None:
         sigma = 1e3 * solution.covariance.std("clock_offset")
-        lines.append(
-            f"  {'camera clock - robot clock, ms':<30}"
-            f"{1e3 * solution.clock_offset:>12.{digits(sigma)}f}"
-            f"{sigma:>14.{digits(sigma)}f}"
-        )
-    lines += [f"  OPEN: {one.text}" for one in solution.undetermined]
+        number = _number(1e3 * solution.clock_offset, sigma)
+        lines.append(f"  {'camera clock - robot clock, ms':<30}{number}")
+    for one in solution.undetermined:
+        lines += _wrapped(f"OPEN: {one.text}")
     return lines
 
 
@@ -204,11 +257,19 @@ def _residual_lines(solution: PoseSolution) -> list[str]:
         f"RESIDUALS per pose; of those used {np.mean(positions[used]):.3f} mm, "
         f"{np.mean(angles[used]):.4f} deg mean"
     ]
-    for i in np.argsort(-positions):
+    # Those dropped first, then the worst.
+    order = np.lexsort((-positions, used))
+    shown = max(_LISTED, len(solution.dropped))
+    for i in order[:shown]:
         mark = "" if used[i] else "   DROPPED: noise cannot explain it"
         lines.append(
             f"  {solution.poses[i]:<20}{positions[i]:>10.3f} mm {angles[i]:>9.4f} deg"
             f"{mark}"
+        )
+    if len(order) > shown:
+        lines.append(
+            f"  and {len(order) - shown} more, of at most "
+            f"{positions[order[shown:]].max():.3f} mm; --json has all"
         )
     return lines
 

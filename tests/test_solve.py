@@ -388,6 +388,20 @@ def test_text_holds_what_is_asked_for():
     assert "estimated from the residuals" in text
 
 
+def test_long_lists_are_cut_but_not_what_was_dropped():
+    robot, observed, mounting, *_ = simulated("eye_in_hand")
+    rng = np.random.default_rng(1)
+    robot, observed = (np.tile(poses, (4, 1, 1)) for poses in (robot, observed))
+    observed = observed @ se3_exp(1e-4 * rng.standard_normal((80, 6)))
+    robot[[7, 70]] = [random_pose(rng) for _ in range(2)]
+    text = solved_text(judge(robot, observed, mounting))
+    listed = text[text.index("RESIDUALS") :].splitlines()[1:]
+    assert len(listed) == 61
+    assert sorted(line.split()[0] for line in listed[:2]) == ["7", "70"]
+    assert all("DROPPED" in line for line in listed[:2])
+    assert listed[-1].startswith("  and 20 more, of at most ")
+
+
 def test_json_is_complete_and_consistent():
     robot, observed, mounting, *_ = simulated("eye_to_hand")
     data = json.loads(
@@ -513,6 +527,22 @@ def test_a_scara_with_a_measured_shift_passes(capsys, tmp_path):
     code, out, _ = call(capsys, "solve", path)
     assert code == 4
     assert "OPEN: the shift along the axis" in out
+    # Moved along the axis, X and Z fit as well: these numbers have no sigma.
+    opened = [line.split()[0] for line in out.splitlines() if line.endswith(" OPEN")]
+    shifted = np.eye(4)
+    shifted[2, 3] = 1.0
+    moved = {
+        "flange_from_target": (x, shifted @ x),
+        "base_from_camera": (z, shifted @ z),
+        "target_from_flange": (se3_inverse(x), se3_inverse(shifted @ x)),
+        "camera_from_base": (se3_inverse(z), se3_inverse(shifted @ z)),
+    }
+    assert sorted(opened) == sorted(
+        f"{name}.{axis},"
+        for name, (here, there) in moved.items()
+        for axis, change in zip("xyz", (there - here)[:3, 3], strict=True)
+        if abs(change) > 0.02
+    )
     code, out, _ = call(
         capsys, "solve", path, "--shift-along-axis-mm", 1e3 * x[2, 3], "--json"
     )

@@ -13,14 +13,19 @@ from handeye_tri.cli.progress import cap_threads
 
 @commands.command(epilog=example("handeye-tri solve poses.json"))
 @click.argument("poses", type=click.Path(path_type=Path))
-@click.option("--method", default="likelihood", show_default=True, help="Or a solver.")
+@click.option(
+    "--method",
+    default="likelihood",
+    show_default=True,
+    help="Or the name of a closed form, such as shah, li, tsai_lenz or park_martin.",
+)
 @click.option(
     "--format",
     "layout",
     type=click.Choice(["poses", "moveit"]),
     default="poses",
     show_default=True,
-    help="Of the file; see scripts/README.md.",
+    help="Of the file; scripts/README.md describes both.",
 )
 @click.option(
     "--mounting",
@@ -33,8 +38,12 @@ from handeye_tri.cli.progress import cap_threads
     type=float,
     help="Measured, where the poses leave it open (4-axis robots).",
 )
-@click.option("--limit-mm", default=10.0, show_default=True, help="Position residual.")
-@click.option("--limit-deg", default=1.0, show_default=True, help="Angle residual.")
+@click.option(
+    "--limit-mm", default=10.0, show_default=True, help="Largest RMS position residual."
+)
+@click.option(
+    "--limit-deg", default=1.0, show_default=True, help="Largest RMS angle residual."
+)
 @click.option("--seed", default=0, show_default=True, help="Of the random samples.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON only.")
 def solve(
@@ -49,7 +58,11 @@ def solve(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Solve bare pose pairs of any robot and any target, and judge them."""
+    """Solve bare pose pairs of any robot and any target, and judge them.
+
+    POSES states mounting, directions and units; nothing is guessed (see
+    scripts/README.md). Exit code: 0 PASS, 3 FAIL, 4 CANNOT TELL, 2 input not usable.
+    """
     import json
     import math
 
