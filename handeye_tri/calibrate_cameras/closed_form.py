@@ -134,8 +134,9 @@ def _scored(
         Homographies moved onto the constraints; the conic; its covariance, (6, 6).
     """
     measured = homographies.matrix
-    moved, spread = measured, homographies.covariance
-    of_b = np.zeros((6, 6))
+    spread = homographies.covariance
+    moved: Floats = measured
+    of_b: Floats = np.zeros((6, 6))
     for _ in range(_SCORING_STEPS):
         missed, _, shared = _condition(measured, moved, spread, b)
         step = np.einsum("nr,nri->ni", missed, shared)
@@ -148,8 +149,8 @@ def _scored(
         s = np.maximum(s, np.finfo(float).eps * s.max(initial=0.0))
         gain = tangent @ (vt.T / s)
         b = b - gain @ (u.T @ missed.ravel())
-        b = b / np.linalg.norm(b)
-        of_b = gain @ gain.T
+        b = np.asarray(b / np.linalg.norm(b))
+        of_b = np.asarray(gain @ gain.T)
     return replace(homographies, matrix=moved), b, of_b
 
 
@@ -173,8 +174,8 @@ def _condition(
     missed = conic_constraints(moved) @ b + (derivative @ change)[..., 0]
     shared = derivative @ spread
     root = np.linalg.cholesky(shared @ np.swapaxes(derivative, -1, -2))
-    whitened = np.linalg.solve(root, missed[..., None])[..., 0]
-    return whitened, root, np.linalg.solve(root, shared)
+    whitened = np.asarray(np.linalg.solve(root, missed[..., None])[..., 0])
+    return whitened, np.asarray(root), np.asarray(np.linalg.solve(root, shared))
 
 
 def _nominal_conic() -> Floats:
