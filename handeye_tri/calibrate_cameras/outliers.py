@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
+from scipy.special import chdtri, fdtri
 
 from handeye_tri.calibrate_cameras.closed_form import NOMINAL_FOCAL
 from handeye_tri.calibrate_cameras.degeneracy import is_turn
@@ -46,6 +46,8 @@ _SUBSETS = 60
 _CHANCE = 1e-5
 # Observations of a half-turn less its pose, camera and O being known.
 _FREEDOM = 6
+# Of a median of chi-squares of that freedom against their mean.
+_MEDIAN_EFFICIENCY = 0.58
 # Variance over what was stated beyond which nothing has been agreed upon.
 _MAX_SCALE = 1e4
 
@@ -61,16 +63,18 @@ class Consensus:
         lost: Rows of the others.
         state: Camera, poses and O from those kept.
         scale: Factor by which the noise exceeds what was stated, squared.
+        votes: Half-turns that this factor was estimated from.
     """
 
     kept: Indices
     lost: Indices
     state: State
     scale: float
+    votes: int
 
     def limit(self, freedom: int) -> float:
         """Largest chi-square of that freedom that a good half-turn may have."""
-        return self.scale * float(chdtri(freedom, _CHANCE))
+        return float(_limits(np.array([freedom]), self.scale, self.votes)[0])
 
 
 def find_consensus(
@@ -110,26 +114,45 @@ def find_consensus(
     if len(sound) < least:
         raise _no_majority(n, len(sound))
     freedom = _FREEDOM - 2.0 * data.about_normal[sound] * (o_mode == "free")
-    limit = chdtri(freedom, _CHANCE)
     core = np.sort(sound[_trimmed(joined(each), basis, least)])
     kept = core
     for _ in range(8):
         part = data.take(kept)
         model = build(part, kept)
         state = solve(model, fit_homographies(part, o_mode, o))
-        square = _misfits(data, build, sound, each, model, state, kept) / limit
-        # Half of the good ones are below the median, which is a fifth of the limit.
-        typical = np.median(square[np.isin(sound, core)]) * limit[0]
-        scale = max(1.0, float(typical) / float(chdtri(freedom[0], 0.5)))
-        good = sound[square <= scale]
+        square = _misfits(data, build, sound, each, model, state, kept)
+        # The core is the best part, at worst: its median is no median of them all.
+        expected = chdtri(freedom, 1.0 - 0.5 * _MAJORITY)
+        typical = float(np.median((square / expected)[np.isin(sound, core)]))
+        scale = max(1.0, typical)
+        excess = square / _limits(freedom, scale, len(core))
+        good = sound[excess <= 1.0]
         if len(good) < least:
-            good = np.sort(sound[np.argsort(square)[:least]])
+            good = np.sort(sound[np.argsort(excess)[:least]])
         if np.array_equal(good, kept):
             break
         kept = good
     if noise_known and scale > _MAX_SCALE:
-        raise _no_majority(n, int((square <= 1.0).sum()))
-    return Consensus(kept, np.setdiff1d(np.arange(n), kept), state, scale)
+        raise _no_majority(n, int((square <= chdtri(freedom, _CHANCE)).sum()))
+    lost = np.setdiff1d(np.arange(n), kept)
+    return Consensus(kept, lost, state, scale, len(core))
+
+
+def _limits(freedom: Floats, scale: float, votes: int) -> Floats:
+    """Largest chi-squares that good half-turns may have.
+
+    Chi-square's own limit where the noise is as stated; where it is more, Fisher's F,
+    since by how much is itself estimated, by a median.
+
+    Args:
+        freedom: Of each chi-square, any shape.
+        scale: Factor by which the noise exceeds what was stated, squared.
+        votes: Half-turns that this factor was estimated from.
+    """
+    if scale <= 1.0:
+        return np.asarray(chdtri(freedom, _CHANCE))
+    known = _MEDIAN_EFFICIENCY * _FREEDOM * votes
+    return np.asarray(scale * freedom * fdtri(freedom, known, 1.0 - _CHANCE))
 
 
 def _no_majority(n: int, count: int) -> DegenerateMotionError:
