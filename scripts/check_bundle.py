@@ -15,7 +15,7 @@ import numpy as np
 
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
 from handeye_tri.calibrate_cameras.bundle import TurnNoise, bundle_cameras
-from handeye_tri.calibrate_cameras.session import turn_covariance
+from handeye_tri.calibrate_cameras.session_camera import turn_covariance
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
 from handeye_tri.records import Repeatability
 from handeye_tri.se3 import SE3, se3_exp

@@ -257,6 +257,9 @@ def _minimum(
         )
     largest = float(np.abs(model.pixels).max())
     rounding = float(np.finfo(float).eps * largest * np.abs(model.whitener).max())
+    if model.turns is not None:
+        # Whitening the difference of two correlated errors magnifies it.
+        rounding /= float(np.sqrt(1.0 - model.turns.correlation.max(initial=0.0)))
     end = minimise(model.evaluate, model.retract, start, rounding)
     assert end is not None
     return end

@@ -10,38 +10,24 @@ from numpy.typing import NDArray
 
 from handeye_tri.calibrate_cameras.bundle import TurnNoise, bundle_cameras
 from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
-from handeye_tri.calibrate_cameras.single_camera import calibrate_camera
-from handeye_tri.camera import LENS_COEFFICIENTS, Lens, PinholeCamera, triangulate
-from handeye_tri.errors import (
-    ConvergenceError,
-    DegenerateMotionError,
-    InputError,
+from handeye_tri.calibrate_cameras.session_camera import (
+    alone_without_outliers,
+    turn_covariance,
 )
-from handeye_tri.records import CameraCalibration, CameraInfo, Repeatability, Session
+from handeye_tri.camera import LENS_COEFFICIENTS, Lens, PinholeCamera, triangulate
+from handeye_tri.errors import DegenerateMotionError
+from handeye_tri.records import (
+    CameraCalibration,
+    CameraInfo,
+    DroppedHalfTurn,
+    Session,
+)
 from handeye_tri.se3 import SE3, nearest_rotation, se3_inverse
 
 Floats = NDArray[np.float64]
 
-# How far from the flange the rig is taken to be, which nobody knows before the
-# hand-eye step: by this lever an orientation error of the robot moves the rig; metres.
-_LEVER = 0.1
 # Correlations of detection errors that are tried where markers lie on the axis.
 _CORRELATIONS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 0.96, 0.985)
-
-
-def turn_covariance(repeatability: Repeatability) -> Floats:
-    """How far a half-turn of the rig misses, from how far the robot repeats.
-
-    Two executed poses make a half-turn, each off by the repeatability, and the rig is
-    0.1 m from the flange: 2 (s_t^2 + (0.1 m)^2 s_r^2) for each translation, 2 s_r^2 for
-    each rotation, correlations left out.
-
-    Returns:
-        Covariance of the tangent (translation m, rotation rad), shape (6, 6).
-    """
-    rotation = 2.0 * repeatability.rotation**2
-    translation = 2.0 * repeatability.translation**2 + _LEVER**2 * rotation
-    return np.diag([translation] * 3 + [rotation] * 3)
 
 
 def calibrate_session_cameras(session: Session) -> CameraCalibration:
@@ -49,10 +35,11 @@ def calibrate_session_cameras(session: Session) -> CameraCalibration:
 
     In steps: (1) each camera alone from the half-turns that it saw whole (Zhao, Liu
     and Zhang 2008, doi:10.1109/TIP.2008.2005562, Sec. III); (2) the same again with
-    the eccentricity of the spheres removed; (3) the cameras' places from the poses
-    that several of them saw (mean of the relative poses); (4) everything adjusted
-    together, with all stations that can be used, twice, so that the eccentricity
-    removed is that of the final cameras.
+    the eccentricity of the spheres removed, and, where chi2 is more than noise
+    explains, without the half-turns that disagree with the others; (3) the cameras'
+    places from the poses that several of them saw (mean of the relative poses); (4)
+    everything adjusted together, with all stations that can be used, twice, so that
+    the eccentricity removed is that of the final cameras.
 
     In step (4) the two stations of a half-turn are independent of each other. Tying
     them together by the robot's repeatability (0.03 mm, 0.005 degrees, at 0.015 px)
@@ -77,7 +64,11 @@ def calibrate_session_cameras(session: Session) -> CameraCalibration:
         - "separate": the calibration of each camera alone, after step (2);
         - "separate_reference_from_camera": the cameras' places after step (3);
         - "on_axis_correlation": what was found where markers lie on the axis, else 0;
-        - "sphere_shift": what was removed from the pixels, shape (m, n, 3, 2).
+        - "sphere_shift": what was removed from the pixels, shape (m, n, 3, 2);
+        - "dropped": a :class:`DroppedHalfTurn` for each half-turn that disagrees with
+          the others, as one camera saw it: a wrong point, exchanged labels, a repeated
+          image, a turn by another angle. That camera's views of it are not used;
+          ``session.without(dropped)`` is the session for the steps that follow.
 
     Raises:
         InputError: a camera's data cannot be used; names the camera.
@@ -91,19 +82,24 @@ def calibrate_session_cameras(session: Session) -> CameraCalibration:
             "the session has no half_turns, and each camera needs at least 3"
         )
     shift = np.zeros((m, n, 3, 2))
-    separate = [_alone(session, i, shift[i]) for i in range(m)]
     spheres = bool(session.marker_radii.any())
-    if spheres:
-        for i in range(m):
-            shift[i] = _shift(
-                session, separate[i].camera, _half_turn_poses(session, separate[i])
+    dropped: list[DroppedHalfTurn] = []
+    separate = []
+    for i in range(m):
+        if spheres:
+            first, _ = alone_without_outliers(
+                session, i, shift[i], only_to_succeed=True
             )
-        separate = [_alone(session, i, shift[i]) for i in range(m)]
-    views = np.array([_half_turn_poses(session, alone) for alone in separate])
+            shift[i] = _shift(session, first.camera, _half_turn_poses(session, first))
+        found, lost = alone_without_outliers(session, i, shift[i])
+        separate.append(found)
+        dropped += lost
+    session = session.without(dropped)
+    views = np.array([_half_turn_poses(session, one) for one in separate])
     places = _places([info.name for info in session.cameras], views)
     cameras = tuple(
-        _with_lens_model(alone.camera, info)
-        for alone, info in zip(separate, session.cameras, strict=True)
+        _with_lens_model(one.camera, info)
+        for one, info in zip(separate, session.cameras, strict=True)
     )
     start = _station_starts(session, cameras, places, views, shift)
     result = _together(session, cameras, places, start, shift, 0.0)
@@ -127,49 +123,18 @@ def calibrate_session_cameras(session: Session) -> CameraCalibration:
         "separate_reference_from_camera": tuple(places),
         "on_axis_correlation": correlation,
         "sphere_shift": shift,
+        "dropped": tuple(dropped),
     }
     return replace(result, details=details)
 
 
-def _alone(session: Session, i: int, shift: Floats) -> CameraCalibration:
-    """Calibrate camera i from its half-turns, pixels less a shift (n, 3, 2)."""
-    info = session.cameras[i]
-    before = [turn.before for turn in session.half_turns]
-    after = [turn.after for turn in session.half_turns]
-    pixels, covariance = session.pixels[i] - shift, session.pixel_covariance[i]
-    whole = np.asarray(np.isfinite(pixels).all(axis=(1, 2)))
-    count = int((whole[before] & whole[after]).sum())
-    need = 3 if info.skew else 2
-    if count < need:
-        raise DegenerateMotionError(
-            f"camera {info.name!r} saw all three markers before and after in only "
-            f"{count} of {len(before)} half-turns, and needs at least {need}"
-            f"{' with skew' if info.skew else ''}; add half-turns in its view"
-        )
-    try:
-        return calibrate_camera(
-            pixels[before],
-            pixels[after],
-            session.triangle,
-            image_size=info.image_size,
-            axis=[turn.axis for turn in session.half_turns],
-            skew=info.skew,
-            distortion=info.lens or None,
-            covariance=np.stack([covariance[before], covariance[after]], axis=1),
-            turn_covariance=turn_covariance(session.repeatability),
-            name=info.name,
-        )
-    except (InputError, DegenerateMotionError, ConvergenceError) as error:
-        raise type(error)(f"camera {info.name!r}: {error}") from error
-
-
-def _half_turn_poses(session: Session, alone: CameraCalibration) -> Floats:
+def _half_turn_poses(session: Session, separate: CameraCalibration) -> Floats:
     """camera_from_triangle at each station, (n, 4, 4), NaN where it is not known."""
     poses = np.full((len(session.stations), 4, 4), np.nan)
-    poses[[t.before for t in session.half_turns]] = alone.details[
+    poses[[t.before for t in session.half_turns]] = separate.details[
         "camera_from_triangle"
     ]
-    poses[[t.after for t in session.half_turns]] = alone.details[
+    poses[[t.after for t in session.half_turns]] = separate.details[
         "camera_from_triangle_after"
     ]
     return poses

@@ -26,6 +26,7 @@ from handeye_tri.records.results import (
 )
 from handeye_tri.records.session import (
     CameraInfo,
+    DroppedHalfTurn,
     HalfTurn,
     Plan,
     Repeatability,
@@ -51,6 +52,7 @@ __all__ = [
     "HandEyeCalibration",
     "TrackEvaluation",
     "CameraInfo",
+    "DroppedHalfTurn",
     "HalfTurn",
     "Plan",
     "Repeatability",

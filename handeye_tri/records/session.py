@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -69,6 +69,32 @@ class HalfTurn:
             raise InputError(
                 f"a half-turn needs two stations, got {self.before} for both"
             )
+
+
+@dataclass(frozen=True, slots=True)
+class DroppedHalfTurn:
+    """A half-turn that disagrees with the others, as one camera saw it.
+
+    Attributes:
+        camera: Name of the camera.
+        half_turn: Index among the session's half-turns.
+        before: Index of its first station.
+        after: Index of its second station.
+        why: What is likely wrong, as "labels exchanged after it: its A, B, C are BAC".
+    """
+
+    camera: str
+    half_turn: int
+    before: int
+    after: int
+    why: str
+
+    def __str__(self) -> str:
+        """One line."""
+        return (
+            f"{self.camera}, half-turn {self.half_turn} (stations {self.before} and "
+            f"{self.after}): {self.why}"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,6 +236,27 @@ class Session:
     def base_from_flange(self) -> Floats:
         """Robot-reported poses, shape (n, 4, 4), metres."""
         return np.array([s.base_from_flange.matrix for s in self.stations])
+
+    def without(self, dropped: Sequence[DroppedHalfTurn]) -> Session:
+        """The same session with the views of these half-turns unseen.
+
+        Only the camera that is named loses them; others keep theirs.
+
+        Raises:
+            InputError: the session has no camera of that name.
+        """
+        if not dropped:
+            return self
+        names = [camera.name for camera in self.cameras]
+        pixels, covariance = self.pixels.copy(), self.pixel_covariance.copy()
+        for one in dropped:
+            if one.camera not in names:
+                raise InputError(
+                    f"the session has no camera {one.camera!r}, only {', '.join(names)}"
+                )
+            views = names.index(one.camera), [one.before, one.after]
+            pixels[views], covariance[views] = np.nan, np.nan
+        return replace(self, pixels=pixels, pixel_covariance=covariance)
 
     def indices(self, kind: StationKind) -> NDArray[np.intp]:
         """Indices of the stations of one kind, ascending."""

@@ -5,7 +5,7 @@ import pytest
 from bundle_scene import LENS, ROBOT, errors, near, nees, observe, scene, true_motions
 
 from handeye_tri.calibrate_cameras.bundle import TurnNoise, bundle_cameras
-from handeye_tri.calibrate_cameras.session import turn_covariance
+from handeye_tri.calibrate_cameras.session_camera import turn_covariance
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.records import HalfTurn
 from handeye_tri.se3 import SE3, se3_exp, se3_inverse, se3_log

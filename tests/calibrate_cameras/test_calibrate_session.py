@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -5,10 +6,11 @@ import pytest
 from bundle_scene import LENS, errors, nees, observe, scene, true_motions
 
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
-from handeye_tri.calibrate_cameras.session import turn_covariance
-from handeye_tri.errors import DegenerateMotionError
-from handeye_tri.records import Repeatability
-from handeye_tri.se3 import SE3, se3_adjoint, se3_exp, se3_inverse, se3_log
+from handeye_tri.calibrate_cameras.session_camera import turn_covariance
+from handeye_tri.errors import DegenerateMotionError, InputError
+from handeye_tri.hand_eye import calibrate_hand_eye
+from handeye_tri.records import DroppedHalfTurn, Repeatability
+from handeye_tri.se3 import SE3, se3_adjoint, se3_exp, se3_inverse, se3_log, so3_exp
 from handeye_tri.synthesize import reference_geometry
 
 RADII = (0.0065, 0.008, 0.01)
@@ -183,6 +185,83 @@ def test_turn_covariance_by_sampling():
         sampled[[0, 1, 3, 4, 5]], stated[[0, 1, 3, 4, 5]], rtol=0.05
     )
     assert sampled[2] < stated[2]
+
+
+def swapped(pixels, truth, session, turn):
+    pixels[1, turn.after] = pixels[1, turn.after, [1, 0, 2]]
+    return ["right"], "labels exchanged after it: its A, B, C are B, A, C"
+
+
+def moved_point(pixels, truth, session, turn):
+    pixels[0, turn.before, 2] += (3.0, -4.0)
+    return ["left"], "marker C before it is 5.0 px off"
+
+
+def repeated(pixels, truth, session, turn):
+    pixels[0, turn.after] = pixels[0, turn.before]
+    return ["left"], "same image|unturned"
+
+
+def turned_by_170(pixels, truth, session, turn):
+    _, poses = true_motions(truth)
+    angle = np.radians(170.0)
+    edge = session.triangle.points[0] - session.triangle.points[2]
+    along = edge / np.linalg.norm(edge)
+    motion = np.eye(4)
+    motion[:3, :3] = so3_exp(along * angle)
+    motion[:3, 3] = session.triangle.points[2]
+    motion[:3, 3] -= motion[:3, :3] @ session.triangle.points[2]
+    places, _ = true_motions(truth)
+    seen = poses[turn.before] @ motion
+    points = session.triangle.points @ seen[:3, :3].T + seen[:3, 3]
+    for i, (camera, place) in enumerate(zip(truth.cameras, places, strict=True)):
+        pixels[i, turn.after] = camera.project(place.inverse().apply(points))
+    return ["left", "right"], r"a turn of 1(69|70)\.\d degrees, not 180"
+
+
+@pytest.mark.parametrize("damage", [swapped, moved_point, repeated, turned_by_170])
+def test_a_bad_half_turn_is_named_and_does_no_harm(damage):
+    session, truth = observe(scene(axis="CA"), sigma_px=0.03)
+    pixels, turn = session.pixels.copy(), session.half_turns[5]
+    names, why = damage(pixels, truth, session, turn)
+    bad = replace(session, pixels=pixels)
+    result = calibrate_session_cameras(bad)
+    dropped = result.details["dropped"]
+    assert [(one.camera, one.half_turn) for one in dropped] == [(n, 5) for n in names]
+    for one in dropped:
+        assert (one.before, one.after) == (turn.before, turn.after)
+        assert re.search(why, one.why)
+        assert f"half-turn 5 (stations {turn.before} and {turn.after})" in str(one)
+    rest = bad.without(dropped)
+    lost = [[info.name for info in session.cameras].index(n) for n in names]
+    assert np.isnan(rest.pixels[lost][:, [turn.before, turn.after]]).all()
+    clean = calibrate_session_cameras(rest)
+    assert clean.details["dropped"] == ()
+    np.testing.assert_allclose(
+        errors(result, truth), errors(clean, truth), rtol=1e-6, atol=1e-9
+    )
+    assert result.chi2 / result.dof < 1.5
+    assert calibrate_hand_eye(rest, result).chi2 > 0
+
+
+def test_healthy_sessions_lose_nothing():
+    for seed in range(6):
+        axis = ("normal", "CA", "AB")[seed % 3]
+        session, _ = observe(scene(seed, axis=axis), seed, marker_radii=RADII)
+        assert calibrate_session_cameras(session).details["dropped"] == ()
+
+
+def test_a_robot_that_repeats_worse_than_stated_is_no_outlier():
+    worse = Repeatability(3e-4, 5e-4)
+    session, _ = observe(scene(1), 1, robot=worse)
+    session = replace(session, repeatability=Repeatability(3e-5, 5e-5))
+    assert calibrate_session_cameras(session).details["dropped"] == ()
+
+
+def test_views_of_a_camera_that_is_not_there():
+    session, _ = observe(scene())
+    with pytest.raises(InputError, match="no camera 'top', only left, right"):
+        session.without([DroppedHalfTurn("top", 0, 0, 1, "")])
 
 
 class TestRefusals:
