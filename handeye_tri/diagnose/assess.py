@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,7 @@ from handeye_tri.calibrate_cameras.degeneracy import plane_spread_deg
 from handeye_tri.calibrate_cameras.half_turns import read_half_turns
 from handeye_tri.calibrate_cameras.single_camera import self_check
 from handeye_tri.diagnose.gates import (
+    Finding,
     Verdict,
     half_turn_gate,
     judge,
@@ -43,7 +46,7 @@ def assess(
     """Run every gate on a calibrated session and draw the verdict.
 
     Args:
-        session: What was observed.
+        session: What was observed, without the half-turns that the cameras dropped.
         cameras: Its calibrated cameras.
         calibration: Its calibrated cell.
         track: Its held-out track.
@@ -68,11 +71,22 @@ def assess(
         touch_gate(),
     )
     radius = 1e3 * float(np.mean(radius_95(track.predicted_covariance)))
-    return judge(
+    verdict = judge(
         gates,
         f"Where the robot says a marker is and where the cameras see it agree within "
         f"{radius:.2f} mm (95 %, predicted).",
     )
+    dropped = cameras.details.get("dropped", ())
+    if not dropped:
+        return verdict
+    finding = Finding(
+        "DROPPED",
+        "half-turns that disagree with the others were left out",
+        "; ".join(str(one) for one in dropped),
+        "warning",
+        "look at those images, and repeat those half-turns where they are needed",
+    )
+    return replace(verdict, findings=(*verdict.findings, finding))
 
 
 def radius_95(covariance: Floats) -> Floats:

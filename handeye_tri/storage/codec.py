@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from handeye_tri.errors import InputError, StorageError
 from handeye_tri.records import (
     CameraCalibration,
     Covariance,
+    DroppedHalfTurn,
     GroundTruth,
     HalfTurn,
     HandEyeCalibration,
@@ -196,6 +198,7 @@ def camera_calibration_to_json(result: CameraCalibration) -> Json:
         "condition": result.condition,
         "covariance": covariance_to_json(result.covariance),
         "residuals_px": numbers(result.residuals),
+        "dropped": [asdict(one) for one in result.details.get("dropped", ())],
     }
 
 
@@ -213,6 +216,18 @@ def camera_calibration_from_json(data: Mapping[str, Any]) -> CameraCalibration:
         condition=float(data["condition"]),
         cost_start=float(data["chi2_start"]),
         method=str(data["method"]),
+        details={
+            "dropped": tuple(
+                DroppedHalfTurn(
+                    str(one["camera"]),
+                    int(one["half_turn"]),
+                    int(one["before"]),
+                    int(one["after"]),
+                    str(one["why"]),
+                )
+                for one in data.get("dropped", ())
+            )
+        },
     )
 
 

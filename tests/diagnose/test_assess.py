@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from handeye_tri.adjustment import adjust
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
 from handeye_tri.diagnose import assess, free_scale, radius_95
 from handeye_tri.evaluate import evaluate_track
@@ -23,9 +24,12 @@ def observe(seed):
     return session
 
 
-def judge(session, spread_deg=20.0):
+def judge(session, spread_deg=20.0, jointly=False):
     cameras = calibrate_session_cameras(session)
+    session = session.without(cameras.details["dropped"])
     calibration = calibrate_hand_eye(session, cameras)
+    if jointly:
+        calibration = adjust(session, calibration)
     track = evaluate_track(calibration, session)
     verdict = assess(
         session, cameras, calibration, track,
@@ -59,6 +63,24 @@ def test_a_healthy_session_passes(seed):
     verdict, (scale, sigma) = judge(observe(seed))
     assert verdict.outcome == "PASS", codes(verdict)
     assert abs(scale - 1) < 4 * sigma < 0.01
+
+
+@pytest.mark.parametrize("cameras", [(1,), (0, 1)])
+@pytest.mark.parametrize("jointly", [False, True])
+def test_a_bad_half_turn_is_left_out_and_named(cameras, jointly):
+    session = observe(1)
+    turn = session.half_turns[4]
+    pixels = session.pixels.copy()
+    for i in cameras:
+        pixels[i, turn.after] = pixels[i, turn.after, [1, 0, 2]]
+    verdict, _ = judge(replace(session, pixels=pixels), jointly=jointly)
+    assert verdict.outcome == "PASS", codes(verdict)
+    assert codes(verdict) == {"DROPPED"}
+    (finding,) = verdict.findings
+    for i in cameras:
+        name = session.cameras[i].name
+        assert f"{name}, half-turn 4 (stations {turn.before}" in finding.evidence
+    assert "labels exchanged" in finding.evidence
 
 
 def test_the_scale_scatters_as_it_says():

@@ -8,6 +8,7 @@ from handeye_tri.errors import HandEyeError, StorageError
 from handeye_tri.records import (
     CameraCalibration,
     Covariance,
+    DroppedHalfTurn,
     GroundTruth,
     HalfTurn,
     HandEyeCalibration,
@@ -97,12 +98,14 @@ def test_camera_calibration_keeps_unseen_residuals():
     residuals = RNG.normal(size=(1, 2, 3, 2))
     residuals[0, 1, 2] = np.nan
     result = CameraCalibration(
-        (CAMERA,), (SE3.identity(),), COVARIANCE, 3.0, 4, residuals, 1e5, 9.0, "way"
-    )
+        (CAMERA,), (SE3.identity(),), COVARIANCE, 3.0, 4, residuals, 1e5, 9.0, "way",
+        {"dropped": (DroppedHalfTurn("left", 5, 10, 11, "the same image"),)},
+    )  # fmt: skip
     back = codec.camera_calibration_from_json(
         through_text(codec.camera_calibration_to_json(result))
     )
     assert np.array_equal(back.residuals, residuals, equal_nan=True)
+    assert back.details == result.details
     assert back.covariance.labels == COVARIANCE.labels
     assert np.array_equal(back.covariance.matrix, COVARIANCE.matrix)
     assert (back.chi2, back.dof, back.condition, back.cost_start, back.method) == (
