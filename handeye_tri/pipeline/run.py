@@ -237,6 +237,12 @@ class Run:
         return [name for name in names if self.folder.file(name).is_file()]
 
     def session(self) -> Session:
+        """What was observed, without half-turns that the cameras' stage dropped."""
+        if not self.folder.file("cameras.json").is_file():
+            return self.observed()
+        return self.observed().without(self.cameras().details["dropped"])
+
+    def observed(self) -> Session:
         """What the estimators get to know."""
         arrays = storage.read_arrays(
             self.folder.file("observations.npz"), ("pixels", "pixel_covariance")

@@ -141,16 +141,19 @@ def _detect(run: Run) -> tuple[list[str], str]:
 def _cameras(run: Run) -> tuple[list[str], str]:
     from handeye_tri.calibrate_cameras import calibrate_session_cameras
 
-    result = calibrate_session_cameras(run.session())
+    result = calibrate_session_cameras(run.observed())
     storage.write_json(
         run.folder.file("cameras.json"),
         {"schema": CAMERAS_SCHEMA, **codec.camera_calibration_to_json(result)},
     )
-    return ["cameras.json"], (
+    line = (
         f"{', '.join(camera.name for camera in result.cameras)} from "
         f"{len(run.plan().half_turns)} half-turns; "
         f"chi2/dof {result.chi2 / result.dof:.2f} (1 = noise as assumed)"
     )
+    for one in result.details["dropped"]:
+        line += f"; dropped {one}"
+    return ["cameras.json"], line
 
 
 def _hand_eye(run: Run) -> tuple[list[str], str]:
