@@ -144,7 +144,7 @@ def _shah(a: Floats, b: Floats) -> tuple[SE3, SE3]:
     mean_rest = both[1] @ sums[3, 3, :3, 3] - sums[:3, 3, 3, 3]
     turned = np.einsum("jik,jk->i", sums[:3, :3, :3, 3], both[1])
     turned -= np.einsum("nji,nj->i", ra, a[:, :3, 3]) / n
-    t_x = np.linalg.solve(_EYE - mean_ra.T @ mean_ra, turned - mean_ra.T @ mean_rest)
+    t_x = _solve_three(_EYE - mean_ra.T @ mean_ra, turned - mean_ra.T @ mean_rest)
     result = np.zeros((2, 4, 4))
     result[:, :3, :3] = both
     result[0, :3, 3], result[1, :3, 3] = t_x, mean_ra @ t_x - mean_rest
@@ -156,6 +156,24 @@ def _determinant(entries: Floats) -> float:
     """Of nine entries; plain floats, since numpy's takes ten times as long."""
     a, b, c, d, e, f, g, h, i = entries.tolist()
     return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+
+
+def _solve_three(matrix: Floats, right: Floats) -> Floats:
+    """Three equations by Cramer's rule, in plain floats for the same reason."""
+    a, b, c, d, e, f, g, h, i = matrix.ravel().tolist()
+    x, y, z = right.tolist()
+    first, second, third = e * i - f * h, c * h - b * i, b * f - c * e
+    determinant = a * first + d * second + g * third
+    return (
+        np.array(
+            [
+                first * x + second * y + third * z,
+                (f * g - d * i) * x + (a * i - c * g) * y + (c * d - a * f) * z,
+                (d * h - e * g) * x + (b * g - a * h) * y + (a * e - b * d) * z,
+            ]
+        )
+        / determinant
+    )
 
 
 def _li(a: Floats, b: Floats) -> tuple[SE3, SE3]:
