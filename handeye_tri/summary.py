@@ -16,6 +16,9 @@ from handeye_tri.se3 import SE3, so3_left_jacobian_inverse, so3_log
 
 Floats = NDArray[np.float64]
 
+# Factor and unit of what is wrong with a robot, by quantity; else it is an angle.
+_ROBOT_UNITS = {axis: (1e3, "mm") for axis in "xyz"}
+
 
 def digits(sigma: float) -> int:
     """Decimals that show two significant digits of a standard deviation."""
@@ -52,6 +55,7 @@ def summary_text(
         *_verdict(evaluation, cross_check_lines(evaluation)),
         "",
         *_result(evaluation["result"]),
+        *_robot(evaluation["robot"]),
         "",
         _origin(evaluation["track"]["predicted_parts_mm"]),
     ]
@@ -169,6 +173,20 @@ def _result(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return lines
 
 
+def _robot(robot: Mapping[str, Any]) -> list[str]:
+    """Which errors of the robot were estimated, and which the data leave open."""
+    if not robot["asked"]:
+        return []
+    found, left = robot["estimated"], robot["undetermined"]
+    line = f"  {len(found)} of {len(found) + len(left)} errors of the robot estimated"
+    if left:
+        line += (
+            f"; left at zero, since the data do not tell them: {', '.join(left)} "
+            "(base and flange are those of a robot without them)"
+        )
+    return [line]
+
+
 def _origin(parts: Mapping[str, float]) -> str:
     total = sum(value**2 for value in parts.values())
     shares = sorted(parts.items(), key=lambda item: -item[1])
@@ -221,6 +239,10 @@ def result_rows(
     for name, motion, true_motion in motions:
         block = covariance.block(motion_labels(name))
         rows += motion_rows(name, motion, block, true_motion)
+    for label, value in calibration.robot.items():
+        factor, unit = _ROBOT_UNITS.get(label.rsplit(".", 1)[1], (180 / np.pi, "deg"))
+        sigma = factor * covariance.std(label)
+        rows.append(_row(label, unit, factor * value, sigma, None))
     return rows
 
 

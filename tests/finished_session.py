@@ -170,6 +170,7 @@ def evaluation(done: Finished) -> dict[str, Any]:
                 for r in range(len(track.stations))
             ],
         },
+        "robot": {"asked": [], "estimated": [], "undetermined": []},
         "cross_checks": _cross_checks(done),
         "result": result_rows(done.calibration, done.truth),
     }

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -5,7 +6,7 @@ import pytest
 
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
 from handeye_tri.hand_eye import calibrate_hand_eye
-from handeye_tri.records import Repeatability
+from handeye_tri.records import Covariance, Repeatability
 from handeye_tri.summary import digits, result_rows, round_magnification, summary_text
 from handeye_tri.synthesize import reference_geometry, synthesize
 
@@ -83,6 +84,7 @@ def evaluation(calibrated, **changes):
             "predicted_rms_mm": 0.082, "worst_station": 24, "worst_marker": "B",
             "predicted_parts_mm": {"calibration": 0.03, "pixels": 0.04, "robot": 0.0},
         },
+        "robot": {"asked": [], "estimated": [], "undetermined": []},
         "result": result_rows(*calibrated),
         **changes,
     }  # fmt: skip
@@ -146,3 +148,34 @@ def test_findings_are_told_with_what_to_do(calibrated):
 )
 def test_gaps_are_drawn_round_times_too_long_within_the_limit(largest, expected):
     assert round_magnification(largest, 0.12) == expected
+
+
+def test_errors_of_the_robot_are_told_with_what_was_left_open(calibrated):
+    changed = evaluation(calibrated)
+    robot = {"asked": ["joint-offsets"], "estimated": ["s.offset"]}
+    changed["robot"] = {**robot, "undetermined": ["t.offset"]}
+    text = summary_text(changed, Path("out"), [])
+    assert "1 of 2 errors of the robot estimated; left at zero" in text
+    assert "tell them: t.offset (" in text
+    assert "errors of the robot" not in summary_text(
+        evaluation(calibrated), Path("out"), []
+    )
+
+
+def test_errors_of_the_robot_have_units_for_people(calibrated):
+    calibration, _ = calibrated
+    labels = (*calibration.covariance.labels, "s.offset", "s.x")
+    n = len(labels)
+    matrix = np.diag(np.r_[np.ones(n - 2), 1e-4, 1e-8])
+    found = replace(
+        calibration,
+        covariance=Covariance(labels, matrix),
+        robot={"s.offset": 1e-3, "s.x": 2e-4},
+    )
+    rows = {row["name"]: row for row in result_rows(found, None)}
+    assert rows["s.offset"]["unit"] == "deg"
+    assert rows["s.offset"]["value"] == pytest.approx(np.degrees(1e-3))
+    assert rows["s.offset"]["sigma"] == pytest.approx(np.degrees(1e-2))
+    assert rows["s.x"]["unit"] == "mm"
+    assert rows["s.x"]["value"] == pytest.approx(0.2)
+    assert rows["s.x"]["sigma"] == pytest.approx(0.1)

@@ -109,6 +109,23 @@ class RobotParameters:
             None if whole is None else kinematics,
         )
 
+    def at(self, stations: ArrayLike) -> RobotParameters:
+        """The same parameters at some of the stations, in any order, by index."""
+        index = np.asarray(stations, dtype=np.intp)
+        whole = self.kinematics
+
+        def kinematics(values: Floats) -> tuple[Floats, Floats]:
+            assert whole is not None
+            poses, jacobian = whole(values)
+            return poses[index], jacobian[index]
+
+        return RobotParameters(
+            self.labels,
+            self.jacobian[index],
+            self.sigma,
+            None if whole is None else kinematics,
+        )
+
     def poses(self, reported: Floats, values: Floats) -> tuple[Floats, Floats]:
         """Poses with the parameters applied, and derivatives.
 

@@ -123,6 +123,21 @@ _verb("evaluate", "Compare the robot's and the cameras' track at held-out statio
 _verb("report", "Write the recording (replay.rrd) and report.html.")
 
 
+def _robot_errors(
+    _context: click.Context, _option: click.Parameter, value: str | None
+) -> tuple[str, ...]:
+    """Read the value of --robot."""
+    from handeye_tri.pipeline.run import ROBOT_ERRORS
+
+    asked = tuple(value.split(",")) if value else ()
+    unknown = [name for name in asked if name not in ROBOT_ERRORS]
+    if unknown:
+        raise click.BadParameter(
+            f"{', '.join(unknown)}: give {' or '.join(ROBOT_ERRORS)}, or both"
+        )
+    return asked
+
+
 @commands.command(epilog=example("handeye-tri calibrate out --method separate"))
 @SESSION
 @click.option(
@@ -132,13 +147,26 @@ _verb("report", "Write the recording (replay.rrd) and report.html.")
     show_default=True,
     help="Adjust cameras, markers and robot together, or step by step as the paper.",
 )
+@click.option(
+    "--robot",
+    "robot_errors",
+    callback=_robot_errors,
+    metavar="ERRORS",
+    help="Estimate systematic errors of the robot too, where the data determine them: "
+    "joint-offsets, link-corrections, or both with a comma.",
+)
 @AGAIN
-def calibrate(session: Path, method: str, again: bool) -> None:
+def calibrate(
+    session: Path, method: str, robot_errors: tuple[str, ...], again: bool
+) -> None:
     """Calibrate the cameras and where they and the markers are to the robot."""
     from handeye_tri.storage import SessionFolder
 
     folder = SessionFolder.open(session)
     folder.header["method"] = method
+    folder.header.pop("robot_errors", None)
+    if robot_errors:
+        folder.header["robot_errors"] = list(robot_errors)
     _work(folder, ("calibrate",), again=again)
 
 

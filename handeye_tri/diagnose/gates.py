@@ -230,7 +230,9 @@ _REMEDIES: dict[str, Remedy] = {
     "loop residual / expected": (
         "LOOP",
         "robot poses and camera poses disagree by more (or less) than their noise",
-        "check the stated repeatability, the pairing of poses, and the robot's joints",
+        "check the stated repeatability and the pairing of poses; where joints or "
+        "links of the robot may be off, estimate that too: handeye-tri calibrate "
+        "--robot joint-offsets,link-corrections",
     ),
     "free scale": (
         "SCALE",

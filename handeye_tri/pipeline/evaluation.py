@@ -16,6 +16,7 @@ from handeye_tri.records import HandEyeCalibration, Session, TrackEvaluation
 from handeye_tri.summary import result_rows
 
 if TYPE_CHECKING:
+    from handeye_tri.adjustment import RobotParameters
     from handeye_tri.diagnose import Verdict
     from handeye_tri.evaluate import CrossValidation, Spread, TrackBudget
     from handeye_tri.evaluate.resampling import Recalibrate
@@ -54,10 +55,14 @@ def judged_track(
 ) -> JudgedTrack:
     """The track at held-out stations; without any, cross-validation holds them out."""
     from handeye_tri.evaluate import evaluate_track, track_budget
+    from handeye_tri.pipeline.robot import robot_parameters
 
     if len(session.indices("evaluation")):
+        parameters = robot_parameters(run)
         return JudgedTrack(
-            evaluate_track(hand_eye, session), track_budget(hand_eye, session), None
+            evaluate_track(hand_eye, session, parameters),
+            track_budget(hand_eye, session, parameters),
+            None,
         )
     result = _cross_validation(run, session, hand_eye, progress)
     return JudgedTrack(result.track, result.budget, result)
@@ -70,40 +75,52 @@ def _cross_validation(
     progress: Callable[[int, int], None] | None,
 ) -> CrossValidation:
     from handeye_tri.evaluate import cross_validate
+    from handeye_tri.pipeline.robot import robot_parameters
 
     return cross_validate(
         session,
-        _recalibrate(run.method, hand_eye),
+        _recalibrate(run, hand_eye),
+        robot_parameters=robot_parameters(run),
         rng=np.random.default_rng([run.seed, _FOLDS_STREAM]),
         progress=progress,
     )
 
 
 def _recalibrate(
-    method: str, hand_eye: HandEyeCalibration, on_axis_correlation: float | None = None
+    run: Run, hand_eye: HandEyeCalibration, on_axis_correlation: float | None = None
 ) -> Recalibrate:
     """Calibrates a part of a session as the whole was; jointly it starts from there."""
     from handeye_tri.adjustment import adjust
     from handeye_tri.calibrate_cameras import calibrate_session_cameras
     from handeye_tri.hand_eye import calibrate_hand_eye
+    from handeye_tri.pipeline.robot import robot_parameters
 
-    def jointly(part: Session, _index: NDArray[np.intp]) -> HandEyeCalibration:
-        return adjust(part, hand_eye, on_axis_correlation=on_axis_correlation)
+    parameters = robot_parameters(run)
+
+    def jointly(part: Session, index: NDArray[np.intp]) -> HandEyeCalibration:
+        return adjust(
+            part,
+            hand_eye,
+            robot_parameters=None if parameters is None else parameters.at(index),
+            on_axis_correlation=on_axis_correlation,
+        )
 
     def in_steps(part: Session, _index: NDArray[np.intp]) -> HandEyeCalibration:
         return calibrate_hand_eye(part, calibrate_session_cameras(part))
 
-    return jointly if method == "joint" else in_steps
+    return jointly if run.method == "joint" else in_steps
 
 
 def judge_session(run: Run, judged: JudgedTrack) -> Verdict:
     """Run every gate on the session's files."""
     from handeye_tri.diagnose import assess
+    from handeye_tri.pipeline.robot import with_robot_applied
 
+    session, hand_eye = with_robot_applied(run, run.session(), run.hand_eye())
     return assess(
-        run.session(),
+        session,
         run.cameras(),
-        run.hand_eye(),
+        hand_eye,
         judged.track,
         track_limit=1e-3 * run.cell.track_limit_mm,
         min_plane_spread=float(np.radians(run.cell.plan.min_plane_spread_deg)),
@@ -151,6 +168,7 @@ def evaluate(run: Run) -> tuple[list[str], str]:
         "simulated": session.simulated,
         "cameras_chi2_per_dof": cameras.chi2 / cameras.dof,
         "hand_eye_chi2_per_dof": hand_eye.chi2 / hand_eye.dof,
+        "robot": _robot_json(run, hand_eye),
         "track": {
             **track_json(judged),
             "orientation": _orientation_json(np.degrees(poses.rotation_errors)),
@@ -173,6 +191,19 @@ def evaluate(run: Run) -> tuple[list[str], str]:
         f"{1e3 * judged.track.max:.3f} worst; "
         f"predicted {1e3 * judged.track.predicted_rms:.3f} rms; {verdict.outcome}"
     )
+
+
+def _robot_json(run: Run, hand_eye: HandEyeCalibration) -> dict[str, Any]:
+    """Which errors of the robot were asked for, found, and left at zero."""
+    from handeye_tri.pipeline.robot import robot_parameters
+
+    parameters = robot_parameters(run)
+    labels = () if parameters is None else parameters.labels
+    return {
+        "asked": list(run.robot_errors),
+        "estimated": list(hand_eye.robot),
+        "undetermined": [label for label in labels if label not in hand_eye.robot],
+    }
 
 
 def track_json(judged: JudgedTrack) -> dict[str, Any]:
@@ -222,9 +253,9 @@ def _cross_checks(
     run: Run, session: Session, hand_eye: HandEyeCalibration, judged: JudgedTrack
 ) -> dict[str, Any]:
     """Cross-validation and repeatability; one that cannot be had says why."""
-    from handeye_tri.adjustment import adjust
     from handeye_tri.evaluate import bootstrap, parametric_bootstrap
     from handeye_tri.evaluate.resampling import station_groups
+    from handeye_tri.pipeline.robot import robot_parameters
 
     groups = len(station_groups(session))
     again, with_noise = _REPLICATES[run.method]
@@ -232,15 +263,17 @@ def _cross_checks(
     correlation = 0.0
     if run.method == "joint" and any(t.axis != "normal" for t in session.half_turns):
         # Estimated once more, and held: it varies little from part to part.
-        correlation = adjust(session, hand_eye).details["on_axis_correlation"]
-    recalibrate = _recalibrate(run.method, hand_eye, correlation)
+        again_whole = _recalibrate(run, hand_eye)
+        whole = again_whole(session, np.arange(len(session.stations)))
+        correlation = whole.details["on_axis_correlation"]
+    recalibrate = _recalibrate(run, hand_eye, correlation)
 
     def advance(before: int) -> Callable[[int, int], None]:
         return lambda done, _of: run.progress.advance(before + done, total)
 
     def spread(name: str, draw: Callable[[], Spread]) -> dict[str, Any]:
         try:
-            return _spread_json(draw(), session, hand_eye)
+            return _spread_json(draw(), session, hand_eye, robot_parameters(run))
         except InputError as error:
             return {"not_run": str(error)}
 
@@ -294,7 +327,10 @@ def _validation_json(result: CrossValidation, groups: int) -> dict[str, Any]:
 
 
 def _spread_json(
-    spread: Spread, session: Session, hand_eye: HandEyeCalibration
+    spread: Spread,
+    session: Session,
+    hand_eye: HandEyeCalibration,
+    parameters: RobotParameters | None,
 ) -> dict[str, Any]:
     """Sigmas by resampling beside the covariance's; m, rad, px by label."""
     from handeye_tri.evaluate import track_part
@@ -307,7 +343,7 @@ def _spread_json(
         "failed": spread.failed,
         "drawn_from": spread.units,
         "relative_error": spread.relative_error,
-        "track_calibration_mm": 1e3 * track_part(spread, hand_eye, session),
+        "track_calibration_mm": 1e3 * track_part(spread, hand_eye, session, parameters),
         "rms_ratio_to_covariance": float(np.sqrt(np.mean((found / stated) ** 2))),
         "sigma": dict(zip(labels, found.tolist(), strict=True)),
         "sigma_by_covariance": dict(zip(labels, stated.tolist(), strict=True)),

@@ -59,7 +59,10 @@ def read_results(run: Run, frames: FrameNames) -> Results:
     Raises:
         StorageError: a file of the session is missing or damaged.
     """
-    session, hand_eye, evaluation = run.session(), run.hand_eye(), run.evaluation()
+    from handeye_tri.pipeline.robot import with_robot_applied
+
+    evaluation = run.evaluation()
+    session, hand_eye = with_robot_applied(run, run.session(), run.hand_eye())
     base_from_first = hand_eye.base_from_camera[0]
     cameras = CameraCalibration(
         cameras=hand_eye.cameras,

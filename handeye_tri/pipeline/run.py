@@ -34,6 +34,8 @@ HAND_EYE_SCHEMA = "handeye_tri.hand_eye/1"
 EVALUATION_SCHEMA = "handeye_tri.evaluation/1"
 # How the cell is calibrated: everything together, or step by step.
 METHODS = ("joint", "separate")
+# Systematic errors of the robot that a joint calibration can be asked to estimate.
+ROBOT_ERRORS = ("joint-offsets", "link-corrections")
 _PACKAGES = (
     "handeye-tri",
     "numpy",
@@ -163,6 +165,17 @@ class Run:
                 f"{', '.join(METHODS)}, got {method!r}"
             )
         return method
+
+    @property
+    def robot_errors(self) -> tuple[str, ...]:
+        """Which errors of the robot are estimated, some of ROBOT_ERRORS."""
+        asked = tuple(self.folder.header.get("robot_errors", ()))
+        if not set(asked) <= set(ROBOT_ERRORS):
+            raise StorageError(
+                f"{self.folder.path / 'session.json'}: robot_errors must be some of "
+                f"{', '.join(ROBOT_ERRORS)}, got {', '.join(map(str, asked))}"
+            )
+        return asked
 
     @property
     def model_path(self) -> Path:

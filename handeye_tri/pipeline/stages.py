@@ -159,29 +159,39 @@ def _cameras(run: Run) -> tuple[list[str], str]:
 def _hand_eye(run: Run) -> tuple[list[str], str]:
     from handeye_tri.adjustment import adjust
     from handeye_tri.hand_eye import calibrate_hand_eye
+    from handeye_tri.pipeline.robot import robot_parameters
 
     session = run.session()
     result = calibrate_hand_eye(session, run.cameras())
+    parameters = robot_parameters(run)
     if run.method == "joint":
-        result = adjust(session, result)
+        result = adjust(session, result, robot_parameters=parameters)
     storage.write_json(
         run.folder.file("hand_eye.json"),
         {"schema": HAND_EYE_SCHEMA, **codec.hand_eye_to_json(result)},
     )
     translation = 1e3 * np.sqrt((result.residuals[:, :3] ** 2).sum(axis=1).mean())
     rotation = np.degrees(np.sqrt((result.residuals[:, 3:] ** 2).sum(axis=1).mean()))
+    errors = ""
+    if parameters is not None:
+        errors = (
+            f", {len(result.robot)} of {len(parameters.labels)} errors of the robot"
+        )
     return ["hand_eye.json"], (
-        f"{run.method}, {len(result.residuals)} stations; loop {translation:.3f} mm "
-        f"{rotation:.4f} deg; chi2/dof {result.chi2 / result.dof:.2f}"
+        f"{run.method}, {len(result.residuals)} stations{errors}; "
+        f"loop {translation:.3f} mm {rotation:.4f} deg; "
+        f"chi2/dof {result.chi2 / result.dof:.2f}"
     )
 
 
 def _report(run: Run) -> tuple[list[str], str]:
     from handeye_tri import replay
+    from handeye_tri.pipeline.robot import with_robot_applied
     from handeye_tri.report import Origin, render_report
 
-    session, hand_eye, evaluation = run.session(), run.hand_eye(), run.evaluation()
-    track = judged_track(run, session, hand_eye).track
+    evaluation = run.evaluation()
+    track = judged_track(run, run.session(), run.hand_eye()).track
+    session, hand_eye = with_robot_applied(run, run.session(), run.hand_eye())
     truth = run.truth()
     drawn = drawn_robot(run, session, hand_eye)
     recording = run.folder.file("replay.rrd")
@@ -256,7 +266,7 @@ STAGES = {
             ("rig", "arm"),
             ("plan", "detect", "cameras"),
             _hand_eye,
-            ("method",),
+            ("method", "robot_errors"),
         ),
         Stage(
             "evaluate",
@@ -264,7 +274,7 @@ STAGES = {
             ("rig", "arm", "plan", "track_limit_mm"),
             ("plan", "simulate", "detect", "cameras", "hand_eye"),
             evaluate,
-            ("method",),
+            ("method", "robot_errors"),
         ),
         Stage(
             "report",

@@ -29,7 +29,7 @@ def without_test():
 @pytest.mark.parametrize("method", ["joint", "separate"])
 def test_without_held_out_stations_they_are_held_out_in_turn(without_test, method):
     session, calibration = without_test
-    run = SimpleNamespace(method=method, seed=1)
+    run = SimpleNamespace(method=method, robot_errors=(), seed=1)
     told = []
     judged = judged_track(run, session, calibration, lambda *done: told.append(done))
     assert told[-1] == (6, 6)
