@@ -3,38 +3,38 @@
 from __future__ import annotations
 
 import json
-import uuid
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
-from rerun.chunk import RrdReader
-from rerun.experimental import ViewerClient
 
 from handeye_tri.errors import InputError, StorageError
-from handeye_tri.mechanism import Geometry, Mechanism
+from handeye_tri.mechanism import Mechanism
 from handeye_tri.records import (
     GroundTruth,
     HandEyeCalibration,
     Session,
     TrackEvaluation,
 )
+from handeye_tri.replay.engine import (
+    RrdReader,
+    only_views,
+    recorded,
+    rr,
+    rrb,
+    solid,
+    transform,
+)
 from handeye_tri.replay.shapes import (
     crosses,
     eye_on_cell,
     eye_on_track,
     rings,
-    vertex_normals,
 )
 from handeye_tri.replay.story import Story, legend, numbers, tell
-from handeye_tri.se3 import SE3, quaternion_wxyz, se3_inverse
-from handeye_tri.storage import write_bytes
+from handeye_tri.se3 import SE3, se3_inverse
 
 Floats = NDArray[np.float64]
 Photograph = Callable[[str, int], NDArray[np.uint8]]
@@ -98,30 +98,15 @@ def write_recording(
             f"for these stations and bodies, got {world_from_body.shape}"
         )
     story = tell(session, calibration, track, truth)
-    with ExitStack() as stack:
-        # What cannot be logged is an error here, never a picture without it.
-        stack.callback(rr.set_strict_mode, rr.strict_mode())
-        rr.set_strict_mode(True)
-        folder = stack.enter_context(TemporaryDirectory(prefix="handeye-tri-"))
-        file = Path(folder) / "replay.rrd"
-        recording = rr.RecordingStream(
-            "handeye_tri",
-            recording_id=name,
-            send_properties=False,
-            # Chunks end where the writer ends, not when a clock says so.
-            batcher_config=rr.ChunkBatcherConfig.NEVER(),
-        )
-        recording.set_log_time_enabled(False)
-        recording.save(
-            file, default_blueprint=_layout(calibration, story, base_from_world)
-        )
+    layout = _layout(calibration, story, base_from_world)
+    with recorded(path, name, layout) as recording:
         _log_cell(recording, mechanism, base_from_world)
         _log_cameras(recording, calibration, truth)
         _log_numbers(recording, story, track, verdict)
         for j in range(n):
             recording.set_time(TIMELINE, sequence=j)
             for body, pose in enumerate(world_from_body[j][1:], 1):
-                recording.log(_body_path(mechanism, body), _transform(pose))
+                recording.log(_body_path(mechanism, body), transform(pose))
             _log_gaps(recording, story, j)
             if story.held_out[j]:
                 recording.log(
@@ -134,9 +119,6 @@ def write_recording(
                     f"{_camera_path(camera.name)}/image",
                     image.compress(jpeg_quality=_JPEG_QUALITY),
                 )
-        recording.flush()
-        recording.disconnect()
-        write_bytes(path, file.read_bytes())
 
 
 def read_numbers(path: Path) -> dict[str, Any]:
@@ -162,49 +144,8 @@ def read_numbers(path: Path) -> dict[str, Any]:
         ) from None
 
 
-def connect(url: str) -> ViewerClient:
-    """A client of a running viewer."""
-    return ViewerClient.connect(url)
-
-
 def _camera_path(name: str) -> str:
     return f"cell/base/estimate/{name}"
-
-
-def _transform(motion: Floats) -> rr.Transform3D:
-    """A motion, shape (4, 4); rerun's quaternions are x y z w."""
-    w, x, y, z = quaternion_wxyz(motion[:3, :3])
-    return rr.Transform3D(
-        translation=motion[:3, 3], quaternion=rr.Quaternion(xyzw=[x, y, z, w])
-    )
-
-
-def _solid(geometry: Geometry) -> Any:
-    """A geometry as rerun draws it, in its own frame."""
-    size = geometry.size
-    colour = [round(255 * float(value)) for value in geometry.rgba]
-    look = {"colors": [colour], "fill_mode": "solid"}
-    if geometry.shape == "box":
-        return rr.Boxes3D(half_sizes=[size], **look)
-    if geometry.shape in ("sphere", "ellipsoid"):
-        return rr.Ellipsoids3D(half_sizes=[np.broadcast_to(size, 3)], **look)
-    if geometry.shape == "cylinder":
-        return rr.Cylinders3D(radii=[size[0]], lengths=[2 * size[1]], **look)
-    if geometry.shape == "capsule":
-        # rerun's capsule begins at its first end, ours has its middle at the origin.
-        start = [[0.0, 0.0, -float(size[1])]]
-        return rr.Capsules3D(
-            radii=[size[0]], lengths=[2 * size[1]], translations=start, **look
-        )
-    if geometry.shape == "plane":
-        # Infinite in truth; a thin sheet of the cell's size shows where it is.
-        return rr.Boxes3D(half_sizes=[[2.0, 2.0, 1e-4]], **look)
-    return rr.Mesh3D(
-        vertex_positions=geometry.vertices,
-        triangle_indices=geometry.faces,
-        vertex_normals=vertex_normals(geometry.vertices, geometry.faces),
-        albedo_factor=colour,
-    )
 
 
 def _body_path(mechanism: Mechanism, body: int) -> str:
@@ -219,13 +160,13 @@ def _log_cell(
 ) -> None:
     recording.log("cell", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     world_from_base = se3_inverse(base_from_world.matrix)
-    recording.log("cell/base", _transform(world_from_base), static=True)
+    recording.log("cell/base", transform(world_from_base), static=True)
     recording.log("track", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for geometry in mechanism.geometries:
         body = _body_path(mechanism, geometry.body)
         path = f"{body}/{rr.escape_entity_path_part(geometry.name)}"
-        recording.log(path, _transform(geometry.body_from_geometry.matrix), static=True)
-        recording.log(path, _solid(geometry), static=True)
+        recording.log(path, transform(geometry.body_from_geometry.matrix), static=True)
+        recording.log(path, solid(geometry), static=True)
 
 
 def _log_cameras(
@@ -246,7 +187,7 @@ def _log_cameras(
     to_corner = np.array([[0.0, 0.0, _CORNER], [0.0, 0.0, _CORNER], [0.0, 0.0, 0.0]])
     for source, camera, motion, colour, distance, width in views:
         path = f"cell/base/{source}/{camera.name}"
-        recording.log(path, _transform(motion.matrix), static=True)
+        recording.log(path, transform(motion.matrix), static=True)
         recording.log(
             path,
             rr.Pinhole(
@@ -448,23 +389,9 @@ def _layout(
         rrb.Vertical(text, track, row_shares=[12, 8]),
         column_shares=[9.5, 6.5, 4],
     )
-    _name_by_place(layout, "layout")
-    return rrb.Blueprint(
+    return only_views(
         layout,
         rrb.TimePanel(
             state="collapsed", timeline=TIMELINE, play_state="following", fps=2.0
         ),
-        rrb.BlueprintPanel(state="hidden"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.TopPanel(state="hidden"),
-        auto_layout=False,
-        auto_views=False,
     )
-
-
-def _name_by_place(part: rrb.Container | rrb.View, place: str) -> None:
-    """Give a layout's parts identities that do not change from run to run."""
-    part.id = uuid.uuid5(uuid.NAMESPACE_OID, place)
-    for number, child in enumerate(getattr(part, "contents", ())):
-        if isinstance(child, (rrb.Container, rrb.View)):
-            _name_by_place(child, f"{place}/{number}")

@@ -16,7 +16,8 @@ from typing import Any
 from urllib.parse import quote
 
 from handeye_tri.errors import HandEyeError, InputError, MissingDependencyError
-from handeye_tri.replay.recording import TIMELINE, connect, read_numbers
+from handeye_tri.replay.engine import connect
+from handeye_tri.replay.recording import TIMELINE, read_numbers
 from handeye_tri.storage import write_bytes
 
 # Servers of ours are for the user of this machine only.
