@@ -172,26 +172,29 @@ def test_parametric_bootstrap_finds_the_covariance(axis):
 
 
 def test_bootstrap_of_half_turns_agrees_with_the_covariance():
-    """Mean over data sets, since one of 11 half-turns is off by 22 %."""
+    """Mean over data sets, since one of 6 half-turns is off by 32 %.
+
+    Drawing 6 of 6 would make sigmas twice too large here.
+    """
     found, track = [], []
     for seed in range(4):
-        session, whole, again = calibrated(seed, half_turns=11)
+        session, whole, again = calibrated(seed, half_turns=6)
         spread = bootstrap(session, whole, again, RNG([seed, 9]), replicates=20)
         assert spread.failed == 0
         assert spread.relative_error == pytest.approx(
-            np.sqrt(0.5 / 19 + 0.5 / 10), rel=1e-6
+            np.sqrt(0.5 / 19 + 0.5 / 5), rel=1e-6
         )
         found.append(ratios(spread, whole) ** 2)
         track.append(
             track_part(spread, whole, session)
             / track_budget(whole, session).calibration
         )
-    assert 0.85 < np.sqrt(np.mean(found)) < 1.3
-    assert 0.8 < np.mean(track) < 1.3
+    assert 0.75 < np.sqrt(np.mean(found)) < 1.4
+    assert 0.7 < np.mean(track) < 1.4
 
 
 def test_bootstrap_sees_noise_that_nobody_stated():
-    session, whole, again = calibrated(4, half_turns=11, noise=3.0)
+    session, whole, again = calibrated(4, half_turns=8, noise=3.0)
     spread = bootstrap(session, whole, again, RNG(0), replicates=20)
     assert np.median(ratios(spread, whole)) > 2.0
     # Drawing the stated noise cannot see it.

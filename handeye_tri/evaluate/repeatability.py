@@ -31,6 +31,9 @@ from handeye_tri.triangle import EDGES
 
 Floats = NDArray[np.float64]
 
+# So many times as many half-turns are drawn as there are.
+_DRAWN = 2
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spread:
@@ -77,9 +80,12 @@ def bootstrap(
     (doi:10.1214/aos/1176344552), so that whatever their two stations share stays
     shared. This takes nothing about the noise for granted: sigmas that are larger
     than the covariance's speak of more noise than was stated, or of a wrong model.
-    With n half-turns a sigma itself is only known to 1 / sqrt(2 (n - 1)) of it, and
-    replicates lack a third of the half-turns, which makes it somewhat too large where
-    they are few.
+    With n half-turns a sigma itself is only known to 1 / sqrt(2 (n - 1)) of it.
+
+    Twice as many are drawn as there are, and the covariance of the results is doubled:
+    to first order that is the same, but samples of n out of n lack a third of the
+    half-turns, and where these are few what is left hardly determines the cell, which
+    doubles sigmas that are right (scripts/check_resampling.py measures it).
 
     Args:
         session: Its calibration stations are used.
@@ -100,9 +106,14 @@ def bootstrap(
         )
 
     def draw() -> tuple[Session, NDArray[np.intp]]:
-        return drawn(session, [groups[k] for k in rng.choice(len(groups), len(groups))])
+        chosen = rng.choice(len(groups), _DRAWN * len(groups))
+        return drawn(session, [groups[k] for k in chosen])
 
-    return _spread(calibration, draw, recalibrate, replicates, len(groups), progress)
+    spread = _spread(calibration, draw, recalibrate, replicates, len(groups), progress)
+    covariance = spread.covariance
+    return replace(
+        spread, covariance=Covariance(covariance.labels, _DRAWN * covariance.matrix)
+    )
 
 
 def parametric_bootstrap(
