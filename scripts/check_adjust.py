@@ -6,10 +6,12 @@ Projected points with noise: f 1720 px, baseline 0.25 m, 0.9 m away, 11 half-tur
 triangle of 120 and 130 mm, six held-out stations. The bound comes from numerical
 derivatives of the cameras' projections at the truth, not from the package's own
 Jacobians. NEES is the normalised estimation error squared per unknown: 1 where the
-stated covariance is right.
+stated covariance is right. What lies outside its gate by more than two of its own
+standard errors is named, and the exit code is 1.
 """
 
 import argparse
+import sys
 import time
 import tracemalloc
 from dataclasses import replace
@@ -43,9 +45,15 @@ ROWS = (
     (0.5, 0.03, 0.005),
 )
 GEOMETRIES = 10
+# A robot that is right has 1; the verdict is not PASS from 1.6^2 on.
+CHI2_THAT_SAYS_SO = 2.56
 ROBOT = Repeatability(3e-5, float(np.radians(0.005)))
 BLOCKS = ("left", "right", "base_from_left", "base_from_right",
           "reference_from_right", "flange_from_triangle", "marker")  # fmt: skip
+# Track error over the bound, with and without errors of the robot; NEES; coverage, %.
+BOUND, WRONG_BOUND = 1.04, 1.3
+NEES = (0.93, 1.07)
+COVERAGE = (93.0, 97.0)
 SIZES = dict(zip(BLOCKS, (5, 5, 6, 6, 6, 6, 9), strict=True))
 
 
@@ -193,13 +201,14 @@ def statistics(trials, separate):
         "px    robot mm/deg     separate  joint  bound  joint/bound rms  chi2/dof  "
         "track/predicted  coverage 95 %"
     )
-    tables = []
+    tables, problems = [], []
     for sigma_px, mm, degrees in ROWS:
         robot = Repeatability(1e-3 * mm, float(np.radians(degrees)))
         rng = np.random.default_rng(0)
         limits = []
         scores = {name: [] for name in BLOCKS}
-        inside, joint, chi2, steps = [], [], [], []
+        inside = {name: [] for name in BLOCKS}
+        joint, chi2, steps = [], [], []
         for trial in range(trials):
             geometry = reference_geometry(
                 np.random.default_rng([1, trial % GEOMETRIES])
@@ -226,29 +235,54 @@ def statistics(trials, separate):
                 error = np.array([off[label] for label in labels])
                 matrix = found.covariance.block(labels)
                 scores[name].append(error @ np.linalg.solve(matrix, error) / len(error))
-                inside.append(np.abs(error) < 1.959964 * np.sqrt(np.diagonal(matrix)))
+                inside[name].append(
+                    np.abs(error) < 1.959964 * np.sqrt(np.diagonal(matrix))
+                )
             track = evaluate_track(found, session)
             joint.append((track.mean, track.rms, track.predicted_rms))
             chi2.append(found.chi2 / found.dof)
         mean, rms, predicted = np.array(joint).T
         limit = np.array([limits[t % GEOMETRIES] for t in range(trials)])
         squares = np.sqrt((rms**2).mean())
+        over = squares / np.sqrt((limit[:, 1] ** 2).mean())
+        every = np.concatenate([np.concatenate(inside[name]) for name in BLOCKS])
+        row = f"{sigma_px} px, {mm} mm"
+        # The scatter of the mean square of the held-out track over the trials.
+        spread = (rms**2).std() / (rms**2).mean() / (2 * np.sqrt(trials))
+        problems += missed(f"{row}: track over the bound", over, 0, BOUND, spread)
+        whole = 100 * np.array([np.concatenate([inside[n][t] for n in BLOCKS]).mean()
+                                for t in range(trials)])  # fmt: skip
+        problems += missed(f"{row}: coverage, %", whole.mean(), *COVERAGE,
+                           whole.std() / np.sqrt(trials))  # fmt: skip
         print(
             f"{sigma_px:<6}{mm:5} / {degrees:<8}{1e3 * np.mean(steps):9.3f}"
             f"{1e3 * mean.mean():9.3f}{1e3 * limit[:, 0].mean():7.3f}"
-            f"{squares / np.sqrt((limit[:, 1] ** 2).mean()):12.3f}"
+            f"{over:12.3f}"
             f"{np.mean(chi2):17.3f}"
             f"{squares / np.sqrt((predicted**2).mean()):14.3f}"
-            f"{100 * np.concatenate(inside).mean():17.1f}"
+            f"{100 * every.mean():17.1f}",
+            flush=True,
         )
-        tables.append(scores)
-    print("\nNEES +- its standard error   " + "  ".join(f"{r[0]} px" for r in ROWS))
+        tables.append((row, scores, inside))
+    print("\nNEES, coverage in %          " + "   ".join(f"{r[0]:<12}" for r in ROWS))
     for name in BLOCKS:
-        cells = [
-            f"{np.mean(scores[name]):.3f} +-{np.sqrt(2 / SIZES[name] / trials):.3f}"
-            for scores in tables
-        ]
-        print(f"{name:22}" + "  ".join(cells))
+        cells = []
+        for row, scores, inside in tables:
+            nees, cover = np.mean(scores[name]), 100 * np.mean(inside[name], axis=1)
+            cells.append(f"{nees:.3f}  {cover.mean():.1f}")
+            error = np.sqrt(2 / SIZES[name] / trials)
+            problems += missed(f"{row}: NEES of {name}", nees, *NEES, error)
+            problems += missed(f"{row}: coverage of {name}, %", cover.mean(), *COVERAGE,
+                               cover.std() / np.sqrt(trials))  # fmt: skip
+        print(f"{name:22}" + "    ".join(f"{cell:<12}" for cell in cells))
+    return problems
+
+
+def missed(name, found, low, high, error):
+    """Names a figure that is outside its gate by more than two standard errors."""
+    if low - 2 * error <= found <= high + 2 * error:
+        return []
+    return [f"{name} {found:.3f} +- {error:.3f}, must be {low:g} to {high:g}"]
 
 
 def link_frames(arm, joints):
@@ -325,6 +359,7 @@ def wrong_robot(seeds):
             rows[name].append((found.chi2 / found.dof, track.rms, track.predicted_rms))
             left[name] = len(found.details["undetermined"])
     limit = np.sqrt(np.mean([row[2] ** 2 for row in rows["right robot"]]))
+    whole = {}
     for name, values in rows.items():
         chi2, rms, _ = np.array(values).T
         total = np.sqrt((rms**2).mean())
@@ -332,6 +367,13 @@ def wrong_robot(seeds):
             f"{name:20}{chi2.mean():8.2f}{1e3 * total:14.3f}{total / limit:16.2f}"
             f"{left[name]:14}"
         )
+        whole[name] = chi2.mean(), total / limit
+    problems = []
+    if whole["repeatability"][0] < CHI2_THAT_SAYS_SO:
+        problems.append("wrong robot: chi2/dof does not say so")
+    if whole["links"][1] > WRONG_BOUND:
+        problems.append(f"wrong robot: {whole['links'][1]:.2f} times the bound")
+    return problems
 
 
 def crowd(cameras, stations):
@@ -389,14 +431,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trials", type=int, default=300)
     parser.add_argument("--separate", type=int, default=30)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=6)
     parser.add_argument("--stations", type=int, default=100_000)
     options = parser.parse_args()
-    statistics(options.trials, options.separate)
-    wrong_robot(options.seeds)
+    problems = statistics(options.trials, options.separate)
+    problems += wrong_robot(options.seeds)
     cost(
         ((2, 22), (2, 1000), (2, 10_000), (2, options.stations), (1, 1000), (64, 1000))
     )
+    for problem in problems:
+        print(f"MISSED  {problem}")
+    sys.exit(1 if problems else 0)
 
 
 if __name__ == "__main__":
