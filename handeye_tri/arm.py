@@ -42,6 +42,7 @@ class Arm:
         lower: Lower limits, shape (q,), rad or m; -inf where there is none.
         upper: Upper limits, shape (q,), rad or m; inf where there is none.
         home: The model's reference configuration, within the limits, shape (q,).
+        slides: Which joints slide (else they turn), shape (q,).
         speed: Speed limits, shape (q,), rad/s or m/s; inf where the model has none.
         base_from_world: The base that poses refer to.
         clearance: Solids nearer than this to each other count as colliding, m.
@@ -70,6 +71,7 @@ class Arm:
         self.lower = np.array([joint.lower for joint in joints])
         self.upper = np.array([joint.upper for joint in joints])
         self.home = np.clip([j.reference for j in joints], self.lower, self.upper)
+        self.slides = np.array([joint.kind == "slide" for joint in joints])
         self.speed = np.array([joint.speed for joint in joints])
         # Per body: the Pinocchio joint that carries it, and its pose there.
         self._carrier: list[int] = []
@@ -81,7 +83,7 @@ class Arm:
         placements = np.array([m.homogeneous for m in self.model.jointPlacements][1:])
         self._chain = SerialChain(
             placements,
-            np.array([joint.kind == "slide" for joint in joints]),
+            self.slides,
             (self._carried[mechanism.flange_body] @ mechanism.body_from_flange).matrix,
             self.lower,
             self.upper,

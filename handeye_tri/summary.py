@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.camera import INTRINSIC_NAMES
-from handeye_tri.records import GroundTruth, HandEyeCalibration, motion_labels
+from handeye_tri.records import GroundTruth, HandEyeCalibration, Plan, motion_labels
 from handeye_tri.se3 import SE3, so3_left_jacobian_inverse, so3_log
 
 Floats = NDArray[np.float64]
@@ -65,6 +66,55 @@ def summary_text(
             lines.append(f"  {folder / name}" + ("   start here" if not number else ""))
     lines += ["", f"NEXT  handeye-tri replay {folder}"]
     return "\n".join(lines)
+
+
+def plan_text(plan: Plan, cell: str) -> str:
+    """What a programme promises, before the robot moves.
+
+    Args:
+        plan: The programme.
+        cell: Name of the cell.
+    """
+    number = plan.certificate
+    held_out = sum(station.kind == "evaluation" for station in plan.stations)
+    lines = [
+        f"VERDICT  {plan.outcome}      cell {cell}, before the robot moves",
+        f"  {len(plan.half_turns)} half-turns, {len(plan.stations) - held_out} "
+        f"stations + {held_out} held out; {number['cycle_time_s']:.1f} s of moves",
+        f"  Track error over the workspace box: {number['track_predicted_rms_mm']:.3f} "
+        "mm rms expected,",
+        f"  of which {number['track_calibration_rms_mm']:.3f} from the calibration"
+        + (
+            f" (no choice of as many half-turns from {number['candidates']:.0f}: "
+            f"below {number['relaxed_bound_mm']:.3f})"
+            if "relaxed_bound_mm" in number
+            else ""
+        ),
+        f"  Planes {number['plane_spread_deg']:.0f} deg apart; axes "
+        f"{number['axis_spread']:.2f} of 1; rank {number['rank']:.0f} of "
+        f"{number['unknowns']:.0f}; condition {number['condition']:.1e}",
+        f"  Assumed: centres to {number['sigma_px']} px; cameras, rig and robot as the "
+        "cell describes them",
+        *(
+            line
+            for finding in plan.findings
+            for line in wrap(finding, 86, initial_indent="  ", subsequent_indent="    ")
+        ),
+        "",
+        f"{'EXPECTED':<43}+- (1 sd)",
+    ]
+    for name, value in number.items():
+        if name.startswith("sigma."):
+            label, unit = _unit(name.removeprefix("sigma."))
+            lines.append(f"  {label + unit:<36}{value:>12.{digits(value)}f}")
+    return "\n".join(lines)
+
+
+def _unit(name: str) -> tuple[str, str]:
+    for unit in ("px", "mm", "deg"):
+        if name.endswith(f"_{unit}"):
+            return name.removesuffix(f"_{unit}"), f", {unit}"
+    return name, ""
 
 
 def check_text(checked: Mapping[str, Any]) -> str:

@@ -149,3 +149,36 @@ def test_an_interrupt_leaves_with_130(capsys, monkeypatch):
     code, _, err = call(capsys, "run")
     assert code == 130
     assert "goes on where it was" in err
+
+
+STATIONS = """s_deg,l_deg,u_deg,r_deg,b_deg,t_deg
+0,0,0,0,0,0
+0,0,0,0,0,180
+"""
+
+
+def test_plan_judges_a_users_own_stations(capsys, tmp_path):
+    """Two stations that no camera sees; what they lack, and the verdict's code."""
+    listed = tmp_path / "stations.csv"
+    listed.write_text(STATIONS)
+    code, out, _ = call(
+        capsys, "plan", tmp_path / "out", "--cell", "hp3_stereo", "--certify", listed
+    )
+    assert code == 4
+    assert out.startswith("VERDICT  CANNOT TELL")
+    assert "1 half-turns: at least 2" in out
+    assert "Do: add a half-turn" in out
+    assert (tmp_path / "out" / "plan.json").is_file()
+
+
+def test_plan_names_what_a_list_of_stations_lacks(capsys, tmp_path):
+    listed = tmp_path / "stations.csv"
+    listed.write_text(STATIONS.replace("t_deg", "t"))
+    arguments = ("plan", tmp_path / "out", "--certify", listed)
+    code, _, err = call(capsys, *arguments, "--cell", "hp3_stereo")
+    assert code == 2
+    assert "line 1 must have one column for joint t, t_deg or t_rad" in err
+    assert not (tmp_path / "out").exists()
+    code, _, err = call(capsys, *arguments)
+    assert code == 2
+    assert "--certify needs --cell" in err

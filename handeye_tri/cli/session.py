@@ -87,20 +87,47 @@ def run(
 @click.option(
     "--half-turns", type=click.IntRange(min=2), help="Half-turns of a new session."
 )
+@click.option(
+    "--certify",
+    type=click.Path(path_type=Path),
+    help="Judge the stations of this CSV file (columns such as s_deg) instead.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print plan.json only.")
 @AGAIN
 def plan(
-    session: Path, cell: str | None, seed: int, half_turns: int | None, again: bool
+    session: Path,
+    cell: str | None,
+    seed: int,
+    half_turns: int | None,
+    certify: Path | None,
+    as_json: bool,
+    again: bool,
 ) -> None:
-    """Plan the robot's stations: reachable, visible, free of collision."""
-    from handeye_tri.pipeline import start
-    from handeye_tri.storage import SessionFolder
+    """Plan the robot's stations, and say what they promise before it moves.
 
+    Reachable, visible, free of collision, and chosen for the least track error.
+    """
+    import json
+
+    from handeye_tri import storage
+    from handeye_tri.pipeline import PLAN_SCHEMA, start
+    from handeye_tri.summary import plan_text
+
+    if certify is not None and cell is None:
+        raise click.UsageError("--certify needs --cell: which arm, rig and cameras?")
     folder = (
-        SessionFolder.open(session)
+        storage.SessionFolder.open(session)
         if cell is None
-        else start(cell, session, seed, half_turns)
+        else start(cell, session, seed, half_turns, certify)
     )
-    _work(folder, ("plan",), again=again)
+    finished = _work(folder, ("plan",), again=again)
+    made = finished.plan()
+    if as_json:
+        data = storage.read_json(finished.folder.file("plan.json"), PLAN_SCHEMA)
+        click.echo(json.dumps(data, indent=1, ensure_ascii=False))
+    else:
+        click.echo(plan_text(made, finished.cell.name))
+    sys.exit(EXIT_CODES[made.outcome])
 
 
 def _verb(name: str, text: str) -> None:

@@ -85,9 +85,20 @@ def software() -> dict[str, str]:
 
 
 def start(
-    cell_name: str, out: Path, seed: int, half_turns: int | None
+    cell_name: str,
+    out: Path,
+    seed: int,
+    half_turns: int | None,
+    stations: Path | None = None,
 ) -> SessionFolder:
     """Check a cell and take a folder for it; writes nothing.
+
+    Args:
+        cell_name: Path of a YAML file, or a name in ``scenes``.
+        out: The session's folder.
+        seed: Of all randomness.
+        half_turns: How many to plan; None: as the cell says.
+        stations: CSV of joint values that stand for a plan of our own.
 
     Raises:
         InputError: the cell or the model cannot be used.
@@ -110,9 +121,19 @@ def start(
             "half_turns": cell.plan.half_turns if half_turns is None else half_turns,
             "method": METHODS[0],
             "simulated": True,
+            "stations_rad_or_m": stations and _stations(stations, cell, model),
             "stages": {},
         },
     )
+
+
+def _stations(path: Path, cell: Cell, model: Path) -> list[list[float]]:
+    from handeye_tri.arm import Arm
+    from handeye_tri.simulate import compile_mechanism
+
+    arm = Arm(compile_mechanism(cell, model))
+    joints = storage.read_joint_list(path, arm.joint_names, arm.slides)
+    return [[float(value) for value in row] for row in joints]
 
 
 class Run:

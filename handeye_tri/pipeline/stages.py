@@ -26,24 +26,28 @@ from handeye_tri.storage import codec
 
 
 def _plan(run: Run) -> tuple[list[str], str]:
-    from handeye_tri.plan import plan_motions
+    from handeye_tri.plan import certify_stations, plan_motions
 
-    plan = plan_motions(
-        run.designed_cell,
-        run.arm,
-        run.seed,
-        half_turns=int(run.folder.header["half_turns"]),
-        progress=run.progress.advance,
-    )
+    stations = run.folder.header.get("stations_rad_or_m")
+    if stations:
+        plan = certify_stations(run.designed_cell, run.arm, stations)
+    else:
+        plan = plan_motions(
+            run.designed_cell,
+            run.arm,
+            run.seed,
+            half_turns=int(run.folder.header["half_turns"]),
+            progress=run.progress.advance,
+        )
     storage.write_json(
         run.folder.file("plan.json"),
         {"schema": PLAN_SCHEMA, **codec.plan_to_json(plan)},
     )
-    spread = plan.certificate["plane_spread_deg"]
     held_out = sum(s.kind == "evaluation" for s in plan.stations)
     return ["plan.json"], (
         f"{len(plan.half_turns)} half-turns, {len(plan.stations) - held_out} stations "
-        f"+ {held_out} held out; successive planes at least {spread:.0f} deg apart"
+        f"+ {held_out} held out, {plan.certificate['cycle_time_s']:.0f} s; expect "
+        f"{plan.certificate['track_predicted_rms_mm']:.3f} mm rms; {plan.outcome}"
     )
 
 
@@ -249,6 +253,7 @@ STAGES = {
             ("arm", "rig", "cameras", "surroundings", "plan"),
             (),
             _plan,
+            ("stations_rad_or_m",),
         ),
         Stage(
             "simulate",

@@ -21,6 +21,8 @@ from handeye_tri.se3 import hat, se3_inverse
 
 Floats = NDArray[np.float64]
 
+# Detection's standard deviation per axis that predictions assume, pixels.
+EXPECTED_SIGMA_PX = 0.03
 # Prior standard deviations that keep a few stations solvable; far wider than what
 # two half-turns give: pixels for intrinsics, bare numbers for the lens, m and rad.
 _PRIOR_PIXELS = 1000.0
@@ -38,6 +40,9 @@ class StationInformation:
     Attributes:
         labels: Names of the p unknowns, as in a calibration's covariance.
         sigma_px: Standard deviation of a detected centre per axis, pixels.
+        view: Cameras and rig.
+        base_from_world: Shape (4, 4), metres.
+        prior: Weak information on every unknown, shape (p, p).
     """
 
     def __init__(
@@ -55,8 +60,8 @@ class StationInformation:
             repeatability: The robot's pose error.
             sigma_px: Of a detected centre, per axis, pixels.
         """
-        self._view = view
-        self._base_from_world = base_from_world
+        self.view = view
+        self.base_from_world = base_from_world
         self._camera_from_base = se3_inverse(base_from_world @ view.world_from_camera)
         self._pose_covariance = repeatability.covariance
         self.sigma_px = sigma_px
@@ -94,7 +99,7 @@ class StationInformation:
         Returns:
             Shapes (n, m, 3, 2, p), (n, m, 3, 2, 6), (n, m, 3, 2, 3).
         """
-        view = self._view
+        view = self.view
         n, m, p = len(base_from_flange), len(view.cameras), len(self.labels)
         by_unknowns = np.zeros((n, m, 3, 2, p))
         by_error = np.zeros((n, m, 3, 2, 6))
@@ -139,6 +144,13 @@ class StationInformation:
         return np.asarray(each.reshape(-1, 2, size, size).sum(axis=1))
 
     @cached_property
+    def _places(self) -> Floats:
+        """Flange poses in the workspace box that all cameras see, (n, 4, 4)."""
+        world = self.view.draw(np.random.default_rng(0), _DRAWN_PLACES)
+        world = world[self.view.tilt_allowed(world) & self.view.in_image(world)]
+        return np.asarray(self.base_from_world @ world[:_PLACES])
+
+    @cached_property
     def workspace_cost(self) -> Floats:
         """What a covariance of the unknowns costs, shape (p, p).
 
@@ -146,11 +158,36 @@ class StationInformation:
         reported and observed markers that the calibration causes, in m^2, over
         poses in the workspace box that all cameras see.
         """
-        world = self._view.draw(np.random.default_rng(0), _DRAWN_PLACES)
-        world = world[self._view.tilt_allowed(world) & self._view.in_image(world)]
-        base = self._base_from_world @ world[:_PLACES]
-        track = self.track_derivatives(base).reshape(-1, len(self.labels))
+        track = self.track_derivatives(self._places).reshape(-1, len(self.labels))
         return np.asarray(track.T @ track / (len(track) / 3))
+
+    @cached_property
+    def workspace_noise(self) -> float:
+        """Mean squared distance there from a new view's and the robot's noise, m^2."""
+        _, _, by_point = self._derivatives(self._places)
+        normal = np.einsum("nikac,nikad->nkcd", by_point, by_point)
+        seen = self.sigma_px**2 * np.trace(np.linalg.inv(normal), axis1=2, axis2=3)
+        lever = np.concatenate(
+            [np.broadcast_to(np.eye(3), (3, 3, 3)), -hat(self.view.markers)], axis=2
+        )
+        robot = np.trace(
+            lever @ self._pose_covariance @ lever.swapaxes(1, 2), axis1=1, axis2=2
+        )
+        return float(seen.mean() + robot.mean())
+
+    def baseline_sigma(self, covariance: Covariance) -> float:
+        """Predicted sigma of the distance of the first two cameras, metres."""
+        position = np.linalg.inv(self._camera_from_base)[:2]
+        apart = position[1, :3, 3] - position[0, :3, 3]
+        along = apart / np.linalg.norm(apart)
+        gradient = np.zeros(len(self.labels))
+        for pose, camera, sign in zip(
+            position, self.view.cell.cameras[:2], (-1.0, 1.0), strict=True
+        ):
+            labels = [f"base_from_{camera.name}.{q}" for q in "xyz"]
+            places = [self.labels.index(label) for label in labels]
+            gradient[places] = sign * along @ pose[:3, :3]
+        return float(np.sqrt(gradient @ covariance.matrix @ gradient))
 
     def track_derivatives(self, base_from_flange: Floats) -> Floats:
         """Observed less reported marker positions by the unknowns.
@@ -165,7 +202,7 @@ class StationInformation:
             Shape (n, 3, 3, p): station, marker, axis in base.
         """
         by_unknowns, _, by_point = self._derivatives(base_from_flange)
-        triangle = self._view.cell.rig.triangle.points
+        triangle = self.view.cell.rig.triangle.points
         # The triangle's own columns do not move what the cameras observe.
         by_cameras = by_unknowns.copy()
         by_cameras[..., -6:] = 0.0
@@ -173,7 +210,7 @@ class StationInformation:
         pull = np.einsum("nikac,nikap->nkcp", by_point, by_cameras)
         result = -np.linalg.solve(normal, pull)
         rotation = base_from_flange[:, None, :3, :3]
-        rotation = rotation @ self._view.flange_from_triangle.rotation
+        rotation = rotation @ self.view.flange_from_triangle.rotation
         result[..., -6:-3] -= rotation
         result[..., -3:] += rotation @ hat(triangle)
         return np.asarray(result)

@@ -12,19 +12,18 @@ from handeye_tri.arm import Arm
 from handeye_tri.config import Cell
 from handeye_tri.errors import InputError, NoPlanError
 from handeye_tri.plan.candidates import Candidate, CandidateSearch, Prospect
+from handeye_tri.plan.certificate import MIN_AXIS_SPREAD, certify
 from handeye_tri.plan.design import Design
-from handeye_tri.plan.information import StationInformation
+from handeye_tri.plan.information import EXPECTED_SIGMA_PX, StationInformation
 from handeye_tri.plan.poses import View, plane_angles
 from handeye_tri.plan.selection import Selector
 from handeye_tri.plan.sequence import Stops, shortest_order, travel_time
 from handeye_tri.records import HalfTurn, Plan, Station
-from handeye_tri.se3 import SE3, so3_log
+from handeye_tri.se3 import SE3
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
-# Detection's standard deviation per axis that predictions assume, pixels.
-EXPECTED_SIGMA_PX = 0.03
 # Half-turns to choose from, per half-turn wanted, and at most.
 _POOL = 90
 _LARGEST_POOL = 1000
@@ -33,9 +32,6 @@ _SELECTIONS = 6
 _PATHS = 400
 # Ways to reach a half-turn that the order may choose from.
 _OPTIONS = 6
-# Least spread of the rotation axes between stations over 3-D: the smallest over the
-# largest singular value of all axes.
-_MIN_AXIS_SPREAD = 0.1
 
 _REMEDY = {
     "tilt": "raise plan.max_tilt_deg or bring the cameras closer together",
@@ -74,17 +70,9 @@ def plan_motions(
     calibration's part of the predicted track error over the workspace box least,
     and the order that takes the least time.
 
-    The certificate holds
+    The certificate holds what :func:`~handeye_tri.plan.certificate.certify` predicts
+    from the stations, and
 
-    * ``plane_spread_deg``: smallest angle between successive planes,
-    * ``axis_spread``: smallest over largest singular value of the rotation axes
-      between stations (1: all directions alike, 0: in a plane),
-    * ``sigma_px``: the detection error that the predictions assume,
-    * ``sigma.<camera>.fx_px`` (``fy_px skew_px cx_px cy_px``, lens by name),
-      ``sigma.base_from_<camera>.translation_mm`` and ``.rotation_deg``: predicted
-      standard deviations (for motions: of the three axes together),
-    * ``track_calibration_rms_mm``: the calibration's part of the predicted distance
-      between reported and observed markers, over the workspace box,
     * ``relaxed_bound_mm``: no choice among the candidates has a lower one,
     * ``candidates``: half-turns that were chosen from,
     * ``cycle_time_s``: of all moves, from the arm's home, without what it stands
@@ -309,7 +297,13 @@ class _Planner:
         turns = tuple(
             HalfTurn(2 * k, 2 * k + 1, self.cell.rig.axis) for k in range(len(chosen))
         )
-        certificate = self._certificate(chosen)
+        certified = certify(
+            self.cell,
+            self.model,
+            np.concatenate([c.base_from_flange for c in chosen]),
+            np.arange(2 * len(chosen)).reshape(-1, 2),
+        )
+        certificate = dict(certified.numbers)
         certificate["relaxed_bound_mm"] = float(1e3 * np.sqrt(bound))
         certificate["candidates"] = float(pool)
         route = np.array(
@@ -317,7 +311,7 @@ class _Planner:
         )
         times = self._time(route[:-1], route[1:])
         certificate["cycle_time_s"] = float(times.sum())
-        if certificate["axis_spread"] < _MIN_AXIS_SPREAD:
+        if certificate["axis_spread"] < MIN_AXIS_SPREAD:
             self.rejected["axis_spread"] += 1
             raise self._no_plan(1, "the rotations do not span 3-D", "axis_spread")
         return Plan(
@@ -326,38 +320,9 @@ class _Planner:
             dict(self.rejected),
             certificate,
             self.seed,
+            certified.outcome,
+            certified.findings,
         )
-
-    def _certificate(self, chosen: list[Candidate]) -> dict[str, float]:
-        normals = np.array([c.normal for c in chosen])
-        poses = np.concatenate([c.base_from_flange for c in chosen])
-        certificate = {
-            "plane_spread_deg": float(
-                np.degrees(plane_angles(normals[:-1], normals[1:]).min())
-            ),
-            "axis_spread": _axis_spread(poses[:, :3, :3]),
-            "sigma_px": EXPECTED_SIGMA_PX,
-        }
-        model = self.model
-        covariance = model.covariance(model.of_stations(poses).sum(axis=0))
-        for label in covariance.labels:
-            owner, quantity = label.rsplit(".", 1)
-            if "_from_" not in owner:
-                unit = "_px" if quantity in ("fx", "fy", "skew", "cx", "cy") else ""
-                certificate[f"sigma.{label}{unit}"] = covariance.std(label)
-        for camera in self.cell.cameras:
-            name = f"base_from_{camera.name}"
-            sigma = np.array([covariance.std(f"{name}.{q}") for q in "xyz"])
-            turn = np.array([covariance.std(f"{name}.r{q}") for q in "xyz"])
-            certificate[f"sigma.{name}.translation_mm"] = float(
-                1e3 * np.linalg.norm(sigma)
-            )
-            certificate[f"sigma.{name}.rotation_deg"] = float(
-                np.degrees(np.linalg.norm(turn))
-            )
-        error = float((self.model.workspace_cost * covariance.matrix).sum())
-        certificate["track_calibration_rms_mm"] = float(1e3 * np.sqrt(error))
-        return certificate
 
     def _no_plan(self, drawn: int, what: str, check: str | None = None) -> NoPlanError:
         counts = {name: n for name, n in self.rejected.most_common() if n}
@@ -368,13 +333,3 @@ class _Planner:
             f"rejected by check: {listed}. Do: {_REMEDY[most]}",
             counts,
         )
-
-
-def _axis_spread(rotations: Floats) -> float:
-    """Smallest over largest singular value of the axes between all stations."""
-    first, second = np.triu_indices(len(rotations), 1)
-    turns = so3_log(rotations[first].swapaxes(-1, -2) @ rotations[second])
-    angle = np.linalg.norm(turns, axis=1, keepdims=True)
-    moving = angle[:, 0] > 1e-3
-    singular = np.linalg.svd(turns[moving] / angle[moving], compute_uv=False)
-    return float(singular[-1] / singular[0])

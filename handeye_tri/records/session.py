@@ -107,6 +107,9 @@ class Plan:
         rejected: Rejected candidates by the check that rejected them.
         certificate: Numbers that the plan promises, by name; unit in the name.
         seed: What the plan was drawn from.
+        outcome: PASS where the stations determine everything well enough, else FAIL
+            or CANNOT TELL.
+        findings: What is not determined well, and what to do; one sentence each.
     """
 
     stations: tuple[Station, ...]
@@ -114,6 +117,8 @@ class Plan:
     rejected: Mapping[str, int]
     certificate: Mapping[str, float]
     seed: int
+    outcome: Literal["PASS", "FAIL", "CANNOT TELL"]
+    findings: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

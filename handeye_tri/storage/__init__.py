@@ -19,6 +19,7 @@ from handeye_tri.storage.files import (
     write_json,
 )
 from handeye_tri.storage.folder import SessionFolder, decoded, fingerprint
+from handeye_tri.storage.joint_files import read_joint_list, write_joint_list
 from handeye_tri.storage.pose_files import (
     POSES_SCHEMA,
     read_moveit_samples,
@@ -38,6 +39,7 @@ __all__ = [
     "read_bytes",
     "read_cell",
     "read_image",
+    "read_joint_list",
     "read_json",
     "read_moveit_samples",
     "read_pose_pairs",
@@ -46,6 +48,7 @@ __all__ = [
     "write_arrays",
     "write_bytes",
     "write_image",
+    "write_joint_list",
     "write_json",
     "write_tum",
 ]

@@ -126,6 +126,8 @@ def plan_to_json(plan: Plan) -> Json:
         ],
         "rejected_candidates": dict(plan.rejected),
         "certificate": dict(plan.certificate),
+        "outcome": plan.outcome,
+        "findings": list(plan.findings),
     }
 
 
@@ -148,6 +150,8 @@ def plan_from_json(data: Mapping[str, Any]) -> Plan:
         rejected={str(k): int(v) for k, v in data["rejected_candidates"].items()},
         certificate={str(k): float(v) for k, v in data["certificate"].items()},
         seed=int(data["seed"]),
+        outcome=data["outcome"],
+        findings=tuple(str(line) for line in data["findings"]),
     )
 
 

@@ -17,7 +17,7 @@ def plan_of(arm: Arm, joints: np.ndarray) -> Plan:
     stations = tuple(
         Station(k, "calibration", q, SE3(arm.forward(q))) for k, q in enumerate(joints)
     )
-    return Plan(stations, (), {}, {}, 0)
+    return Plan(stations, (), {}, {}, 0, "PASS", ())
 
 
 def test_the_robot_misses_by_its_repeatability() -> None:
@@ -50,7 +50,7 @@ def test_an_exact_robot_goes_where_it_is_told() -> None:
 def test_a_plan_of_another_arm_is_refused() -> None:
     arm = Arm(compile_mechanism(shipped("hp3_stereo"), HP3))
     station = Station(0, "calibration", np.zeros(7), SE3.identity())
-    plan = Plan((station,), (), {}, {}, 0)
+    plan = Plan((station,), (), {}, {}, 0, "PASS", ())
     with pytest.raises(InputError, match="7 joints, the arm has 6"):
         execute(arm, plan, Repeatability(0.0, 0.0), 1)
 

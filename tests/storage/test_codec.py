@@ -65,7 +65,15 @@ def test_plan():
         Station(i, kind, RNG.normal(size=6), SE3.exp(RNG.normal(size=6)))
         for i, kind in enumerate(("calibration", "calibration", "evaluation"))
     )
-    plan = Plan(stations, (HalfTurn(0, 1, "CA"),), {"limits": 3}, {"a_mm": 0.5}, 7)
+    plan = Plan(
+        stations,
+        (HalfTurn(0, 1, "CA"),),
+        {"limits": 3},
+        {"a_mm": 0.5},
+        7,
+        "FAIL",
+        ("a",),
+    )
     back = codec.plan_from_json(through_text(codec.plan_to_json(plan)))
     assert back.half_turns == plan.half_turns
     assert (back.rejected, back.certificate, back.seed) == (

@@ -1,0 +1,239 @@
+"""What a programme promises before the robot moves, and whether that is enough."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.config import Cell
+from handeye_tri.plan.design import Design
+from handeye_tri.plan.information import StationInformation
+from handeye_tri.plan.poses import HALF_TURN, View, plane_angles
+from handeye_tri.se3 import so3_log
+
+Floats = NDArray[np.float64]
+Outcome = Literal["PASS", "FAIL", "CANNOT TELL"]
+
+# Least spread of the rotation axes between stations over 3-D: the smallest over the
+# largest singular value of all axes.
+MIN_AXIS_SPREAD = 0.1
+# Eigenvalues of the information, scaled to unit diagonal, that count as zero: a
+# station list that determines everything is above 1e-7.
+_NO_INFORMATION = 1e-10
+_EPSILON = float(np.finfo(float).eps)
+# A distance of three normal components is below this many rms in 95 of 100 cases
+# (root of chi-square's 95 % point, 3 degrees of freedom, over 3).
+_WITHIN_95 = 1.614
+# A focal length that is known worse than this is not calibrated.
+_WORST_FOCAL = 0.01
+# Half-turns drawn to find the best one to add.
+_DRAWN = 1500
+_PIXELS = ("fx", "fy", "skew", "cx", "cy")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Certificate:
+    """What the stations of a programme tell about the cell.
+
+    Attributes:
+        numbers: By name, unit in the name; see :func:`certify`.
+        outcome: PASS where everything is determined well enough.
+        findings: What is not, with the remedy; one sentence each.
+    """
+
+    numbers: Mapping[str, float]
+    outcome: Outcome
+    findings: tuple[str, ...]
+
+
+def certify(
+    cell: Cell,
+    model: StationInformation,
+    base_from_flange: Floats,
+    turns: NDArray[np.intp],
+) -> Certificate:
+    """Predict a calibration from its stations.
+
+    The numbers are
+
+    * ``sigma_px``: the detection error that the predictions assume,
+    * ``plane_spread_deg``: smallest angle between planes of successive half-turns,
+    * ``axis_spread``: smallest over largest singular value of the rotation axes
+      between stations (1: all directions alike, 0: in a plane),
+    * ``rank``, ``unknowns``, ``condition`` (at most 1 over the machine's precision):
+      of the information, scaled to unit diagonal,
+    * ``sigma.<camera>.fx_px`` (``fy_px skew_px cx_px cy_px``, lens by name),
+      ``sigma.baseline_mm`` (of the first two cameras),
+      ``sigma.base_from_<camera>.translation_mm`` and ``.rotation_deg``: predicted
+      standard deviations (for motions: of the three axes together),
+    * ``track_calibration_rms_mm``: the calibration's part of the predicted distance
+      between reported and observed markers, over the workspace box,
+    * ``track_predicted_rms_mm``: the same with the noise of a new view and of the
+      robot.
+
+    Args:
+        cell: The cell.
+        model: Predicts what stations tell.
+        base_from_flange: Calibration stations, shape (n, 4, 4), metres.
+        turns: Stations before and after each half-turn, shape (k, 2).
+    """
+    information = model.of_stations(base_from_flange).sum(axis=0)
+    values, vectors = _scaled_spectrum(information)
+    covariance = model.covariance(information)
+    normals = model.view.normals(
+        np.linalg.inv(model.base_from_world) @ base_from_flange[turns[:, 0]]
+    )
+    spread = plane_angles(normals[:-1], normals[1:])
+    numbers = {
+        "sigma_px": model.sigma_px,
+        "plane_spread_deg": float(np.degrees(spread.min(initial=np.pi / 2)))
+        if len(turns) > 1
+        else 0.0,
+        "axis_spread": axis_spread(base_from_flange[:, :3, :3]),
+        "rank": float((values > _NO_INFORMATION).sum()),
+        "unknowns": float(len(values)),
+        "condition": float(values[-1] / max(values[0], _EPSILON * values[-1])),
+    }
+    for label in covariance.labels:
+        owner, quantity = label.rsplit(".", 1)
+        if "_from_" not in owner:
+            unit = "_px" if quantity in _PIXELS else ""
+            numbers[f"sigma.{label}{unit}"] = covariance.std(label)
+    for camera in cell.cameras:
+        name = f"base_from_{camera.name}"
+        sigma = np.array([covariance.std(f"{name}.{q}") for q in "xyz"])
+        turn = np.array([covariance.std(f"{name}.r{q}") for q in "xyz"])
+        numbers[f"sigma.{name}.translation_mm"] = float(1e3 * np.linalg.norm(sigma))
+        numbers[f"sigma.{name}.rotation_deg"] = float(np.degrees(np.linalg.norm(turn)))
+    numbers["sigma.baseline_mm"] = 1e3 * model.baseline_sigma(covariance)
+    caused = float((model.workspace_cost * covariance.matrix).sum())
+    numbers["track_calibration_rms_mm"] = float(1e3 * np.sqrt(caused))
+    numbers["track_predicted_rms_mm"] = float(
+        1e3 * np.sqrt(caused + model.workspace_noise)
+    )
+    undetermined = _undetermined(covariance.labels, values, vectors)
+    findings = _findings(cell, numbers, undetermined, len(turns))
+    if findings:
+        findings.append(_addition(cell, model, information))
+    cannot = bool(undetermined) or numbers["axis_spread"] < MIN_AXIS_SPREAD
+    outcome: Outcome = "PASS"
+    if findings:
+        outcome = "CANNOT TELL" if cannot else "FAIL"
+    return Certificate(numbers, outcome, tuple(findings))
+
+
+def _scaled_spectrum(information: Floats) -> tuple[Floats, Floats]:
+    """Ascending eigenvalues and eigenvectors at unit diagonal."""
+    diagonal = np.diag(information)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
+    return np.asarray(values), np.asarray(vectors)
+
+
+def _undetermined(labels: tuple[str, ...], values: Floats, vectors: Floats) -> str:
+    """The quantities that the weakest direction is made of; empty: none is."""
+    if values[0] > _NO_INFORMATION:
+        return ""
+    share = np.square(vectors[:, values <= _NO_INFORMATION]).sum(axis=1)
+    worst = np.argsort(-share, kind="stable")[:3]
+    return ", ".join(labels[k] for k in worst)
+
+
+def _findings(
+    cell: Cell, numbers: Mapping[str, float], undetermined: str, turns: int
+) -> list[str]:
+    found = []
+    if undetermined:
+        found.append(
+            f"the stations do not determine {undetermined} "
+            f"(rank {numbers['rank']:.0f} of {numbers['unknowns']:.0f})"
+        )
+    if numbers["axis_spread"] < MIN_AXIS_SPREAD:
+        found.append(
+            f"the rotations hardly leave a plane (spread {numbers['axis_spread']:.3f}, "
+            f"needs {MIN_AXIS_SPREAD}): the hand-eye transform is two-fold or free"
+        )
+    least = cell.plan.min_plane_spread_deg
+    if turns < 2:
+        found.append(
+            f"{turns} half-turns: at least 2, in planes {least:.0f} degrees apart, are "
+            "needed to calibrate a camera from three points"
+        )
+    elif numbers["plane_spread_deg"] < least:
+        found.append(
+            f"two successive half-turns' planes are {numbers['plane_spread_deg']:.1f} "
+            f"degrees apart, needs {least:.0f} (Proposition 1)"
+        )
+    for camera in cell.cameras:
+        sigma = numbers[f"sigma.{camera.name}.fx_px"]
+        if sigma > _WORST_FOCAL * camera.focal_px[0]:
+            found.append(
+                f"camera {camera.name}: fx would be known to {sigma:.1f} px only"
+            )
+    within = _WITHIN_95 * numbers["track_predicted_rms_mm"]
+    if within > cell.track_limit_mm:
+        found.append(
+            f"markers would agree within {within:.2f} mm (95 %), limit "
+            f"{cell.track_limit_mm:.2f} mm"
+        )
+    return found
+
+
+def _addition(cell: Cell, model: StationInformation, information: Floats) -> str:
+    """Which half-turn helps most, in words; looks at cameras, not at the arm."""
+    view = model.view
+    world = view.draw(np.random.default_rng(0), _DRAWN)
+    for check in (view.tilt_allowed, view.in_image):
+        world = world[check(world) & check(world @ HALF_TURN)]
+    if len(world) == 0:
+        return "Do: turn the cameras to the workspace box; no half-turn there is seen"
+    base = model.base_from_world @ world
+    poses = np.stack([base, base @ HALF_TURN], axis=1)
+    design = Design(
+        model.of_half_turns(poses), model.prior + information, model.workspace_cost
+    )
+    costs = [design.cost(row) for row in np.eye(len(world))]
+    best = int(np.argmin(costs))
+    return (
+        f"Do: add a half-turn {_described(view, world[best])}; then the calibration's "
+        f"part of the track error is {1e3 * np.sqrt(costs[best]):.3f} mm"
+    )
+
+
+def _described(view: View, world_from_flange: Floats) -> str:
+    """Tilt about an axis of the first camera's image, and the place, in words."""
+    pose = view.world_from_camera[0]
+    centre = view.marker_positions(world_from_flange[None])[0].mean(axis=0)
+    normal = pose[:3, :3].T @ view.normals(world_from_flange[None])[0]
+    normal *= -np.sign(normal[2]) or 1.0
+    tilt = np.degrees(np.arctan2(np.hypot(normal[0], normal[1]), abs(normal[2])))
+    # The normal leans towards (x, y); it was turned about the axis across that.
+    axis = np.degrees(np.arctan2(normal[0], -normal[1])) % 180
+    where = ", ".join(f"{value:.2f}" for value in centre)
+    name = view.cell.cameras[0].name
+    return (
+        f"with the triangle at ({where}) m in the world, its plane tilted {tilt:.0f} "
+        f"degrees against camera {name}'s image, about the image direction "
+        f"{axis:.0f} degrees from its x axis"
+    )
+
+
+def axis_spread(rotations: Floats) -> float:
+    """Smallest over largest singular value of the axes between all stations.
+
+    Args:
+        rotations: Shape (n, 3, 3).
+    """
+    first, second = np.triu_indices(len(rotations), 1)
+    turns = so3_log(rotations[first].swapaxes(-1, -2) @ rotations[second])
+    angle = np.linalg.norm(turns, axis=1, keepdims=True)
+    moving = angle[:, 0] > 1e-3
+    if not moving.any():
+        return 0.0
+    axes = turns[moving] / angle[moving]
+    singular = np.linalg.svd(axes.T @ axes, compute_uv=False)
+    return float(np.sqrt(singular[-1] / singular[0]))
