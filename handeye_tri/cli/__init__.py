@@ -9,7 +9,14 @@ from pathlib import Path
 import click
 
 # Each of these adds its verbs to the group.
-from handeye_tri.cli import doctor, exchange, experiment, session, solve
+from handeye_tri.cli import (
+    doctor,
+    exchange,
+    experiment,
+    importing,
+    session,
+    solve,
+)
 from handeye_tri.cli.group import EXIT_CODES, commands
 from handeye_tri.errors import DegenerateMotionError, HandEyeError
 
@@ -18,6 +25,7 @@ __all__ = [
     "doctor",
     "exchange",
     "experiment",
+    "importing",
     "main",
     "session",
     "solve",

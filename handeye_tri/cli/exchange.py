@@ -1,4 +1,4 @@
-"""Verbs that carry results out to other tools, and real robots' data in."""
+"""The verb that carries results out to other tools."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from handeye_tri.storage.cells import (
     shipped,
 )
 from handeye_tri.storage.files import (
+    decode_image,
     read_arrays,
     read_bytes,
     read_image,
@@ -22,14 +23,18 @@ from handeye_tri.storage.folder import SessionFolder, decoded, fingerprint
 from handeye_tri.storage.joint_files import read_joint_list, write_joint_list
 from handeye_tri.storage.pose_files import (
     POSES_SCHEMA,
+    PoseReader,
     read_moveit_samples,
     read_pose_pairs,
 )
+from handeye_tri.storage.structured import read_structured
 from handeye_tri.storage.trajectories import write_tum
 
 __all__ = [
     "POSES_SCHEMA",
+    "PoseReader",
     "SessionFolder",
+    "decode_image",
     "decoded",
     "find_cell",
     "find_model",
@@ -43,6 +48,7 @@ __all__ = [
     "read_json",
     "read_moveit_samples",
     "read_pose_pairs",
+    "read_structured",
     "sha256",
     "shipped",
     "write_arrays",

@@ -6,7 +6,9 @@ import hashlib
 import io
 import json
 import os
+import struct
 import tempfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -158,26 +160,49 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     """Read an image as uint8, shape (h, w) or (h, w, 3) RGB.
 
     Raises:
-        StorageError: missing, not an image, damaged, or too large.
+        StorageError: missing, not an image, damaged, too large, or of more than 8
+            bits a channel.
+    """
+    return decode_image(read_bytes(path), str(path))
+
+
+def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
+    """An image file's content as uint8, shape (h, w) or (h, w, 3) RGB.
+
+    Args:
+        data: The content, in any format that Pillow knows.
+        name: What messages call it.
+
+    Raises:
+        StorageError: as :func:`read_image`.
     """
     from PIL import Image, UnidentifiedImageError
 
-    data = read_bytes(path)
     try:
         with Image.open(io.BytesIO(data)) as picture:
             width, height = picture.size
             if width * height > _MAX_PIXELS:
                 raise StorageError(
-                    f"{path}: {width} x {height} pixels is more than the "
+                    f"{name}: {width} x {height} pixels is more than the "
                     f"{_MAX_PIXELS} allowed"
                 )
-            grey = picture.mode in ("L", "1", "I;16", "I", "F")
+            if picture.mode.startswith(("I", "F")):
+                raise StorageError(
+                    f"{name}: more than 8 bits a channel (mode {picture.mode}); "
+                    "convert the images to 8 bits, all with the same scale"
+                )
+            grey = picture.mode in ("L", "1")
             return np.asarray(picture.convert("L" if grey else "RGB"))
     except UnidentifiedImageError:
         raise StorageError(
-            f"{path}: this is not an image; take or render it again"
+            f"{name}: this is not an image; take or render it again"
         ) from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except (
+        *(OSError, SyntaxError, ValueError, EOFError, OverflowError, MemoryError),
+        *(TypeError, IndexError, struct.error, zlib.error),
+        Image.DecompressionBombError,
+    ) as error:
+        # Pillow's decoders raise all of these for damaged files.
         raise StorageError(
-            f"{path}: this image is damaged ({error}); take or render it again"
+            f"{name}: this image is damaged ({error}); take or render it again"
         ) from None

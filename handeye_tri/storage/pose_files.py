@@ -21,21 +21,20 @@ a homogeneous ``matrix_m`` or ``matrix_mm`` (4 rows).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from handeye_tri.errors import InputError, StorageError
+from handeye_tri.errors import InputError
 from handeye_tri.records import Floats, PoseNoise, PosePairs
 from handeye_tri.se3 import (
     nearest_rotation,
     rotation_from_quaternion_wxyz,
     so3_exp,
 )
-from handeye_tri.storage.files import read_bytes
+from handeye_tri.storage.structured import read_structured
 
 POSES_SCHEMA = "handeye-tri poses 1"
 
@@ -80,13 +79,13 @@ def read_pose_pairs(path: Path, *, orthonormalise: bool = False) -> PosePairs:
         InputError: a key is missing, unknown or contradictory, a number is not
             finite, a rotation is none, or counts differ; the message names it.
     """
-    data = _json(path)
+    data = read_structured(path)
     if not isinstance(data, dict):
         raise InputError(
             f"{path}: this is a list, not an object with a head; a file of pose pairs "
             f'starts with "schema": "{POSES_SCHEMA}" (MoveIt samples: --format moveit)'
         )
-    reader = _Reader(path, orthonormalise)
+    reader = PoseReader(path, orthonormalise)
     schema = data.get("schema")
     if schema != POSES_SCHEMA:
         raise InputError(
@@ -137,10 +136,10 @@ def read_moveit_samples(
             f"{path}: MoveIt samples do not say how the camera is mounted; add "
             "--mounting eye_in_hand or --mounting eye_to_hand"
         )
-    samples = _json(path) if path.suffix == ".json" else _yaml(path)
+    samples = read_structured(path)
     if not isinstance(samples, list) or not samples:
         raise InputError(f"{path}: MoveIt samples are a list, this is none")
-    reader = _Reader(path, orthonormalise)
+    reader = PoseReader(path, orthonormalise)
     both: list[list[Floats]] = []
     for i, sample in enumerate(samples):
         if isinstance(sample, Mapping):
@@ -167,24 +166,7 @@ def read_moveit_samples(
     )
 
 
-def _json(path: Path) -> Any:
-    try:
-        return json.loads(read_bytes(path).decode())
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise StorageError(f"{path}: this is not readable JSON ({error})") from None
-
-
-def _yaml(path: Path) -> Any:
-    from ruamel.yaml import YAML, YAMLError
-
-    try:
-        return YAML(typ="safe", pure=True).load(read_bytes(path).decode())
-    except (UnicodeDecodeError, YAMLError) as error:
-        first = str(error).splitlines()[0]
-        raise StorageError(f"{path}: this is not readable YAML ({first})") from None
-
-
-class _Reader:
+class PoseReader:
     """Reads parts of one file; every message starts with its path."""
 
     def __init__(self, path: Path, orthonormalise: bool) -> None:
@@ -192,9 +174,11 @@ class _Reader:
         self.orthonormalise = orthonormalise
 
     def fail(self, text: str) -> InputError:
+        """An error that names the file."""
         return InputError(f"{self.path}: {text}")
 
     def only(self, data: Mapping[str, Any], known: set[str], where: str) -> None:
+        """Refuse keys that are not known."""
         unknown = sorted(set(data) - known)
         if unknown:
             raise self.fail(
@@ -203,11 +187,13 @@ class _Reader:
             )
 
     def need(self, data: Any, key: str, where: str) -> Any:
+        """The value of a key that must be there."""
         if not isinstance(data, Mapping) or key not in data:
             raise self.fail(f"{where} lacks {key!r}")
         return data[key]
 
     def word(self, data: Mapping[str, Any], key: str) -> str:
+        """One of the words that a key of the head allows."""
         allowed = " or ".join(f'"{word}"' for word in _HEAD[key])
         if key not in data:
             raise self.fail(
@@ -218,6 +204,7 @@ class _Reader:
         return str(data[key])
 
     def noise(self, data: Any) -> PoseNoise | None:
+        """The optional noise of the head."""
         if data is None:
             return None
         if not isinstance(data, Mapping):
@@ -276,6 +263,7 @@ class _Reader:
         return poses[0], poses[1], tuple(names), times
 
     def items(self, data: Any, key: str) -> list[Any]:
+        """A list of mappings with at least one item."""
         if not isinstance(data, list) or not data:
             raise self.fail(f'"{key}" must be a list with at least one item')
         for i, item in enumerate(data):
@@ -284,6 +272,7 @@ class _Reader:
         return data
 
     def pose(self, data: Any, where: str) -> Floats:
+        """A pose in any of the forms of the module's head, shape (4, 4), metres."""
         if not isinstance(data, Mapping):
             raise self.fail(f"{where} must be an object, got {data!r:.60}")
         known = {*_TRANSLATIONS, *_MATRICES, *_ROTATIONS, "time_s", "name"}
@@ -310,6 +299,7 @@ class _Reader:
         return result
 
     def matrix(self, data: Any, unit: float, where: str) -> Floats:
+        """A homogeneous matrix, its lengths times ``unit``, shape (4, 4)."""
         flat = isinstance(data, list) and len(data) == 16
         given = self.numbers(data, (16,) if flat else (4, 4), where).reshape(4, 4)
         if np.abs(given[3] - (0, 0, 0, 1)).max() > 1e-9:
@@ -323,6 +313,7 @@ class _Reader:
         return result
 
     def rotation(self, key: str, data: Any, where: str) -> Floats:
+        """A rotation in the form that ``key`` names, shape (3, 3)."""
         if key == "rotation_matrix":
             return self.nearest(self.numbers(data, (3, 3), where), where)
         if key == "quaternion":
@@ -341,6 +332,7 @@ class _Reader:
         return so3_exp(unit * self.numbers(data, (3,), where))
 
     def euler(self, data: Any, where: str) -> Floats:
+        """A rotation by three angles, order and kind of axes stated, shape (3, 3)."""
         self.only(data, {"order", "about", "angles_deg"}, where)
         order = str(self.need(data, "order", where))
         about = self.need(data, "about", where)
@@ -382,6 +374,7 @@ class _Reader:
         return nearest_rotation(rotation) if defect > _EXACT else rotation
 
     def allow(self, defect: float, text: str, detail: str) -> None:
+        """Accept a rotation's defect, or say what it is and what to do."""
         if defect <= _EXACT or (self.orthonormalise and defect <= _ROUNDED):
             return
         advice = (
@@ -392,6 +385,7 @@ class _Reader:
         raise self.fail(f"{text} {defect:.2g}{detail}, allowed {_EXACT:g}; {advice}")
 
     def numbers(self, data: Any, shape: tuple[int, ...], where: str) -> Floats:
+        """Finite numbers of a given shape."""
         try:
             array = np.array(data, dtype=float)
         except (TypeError, ValueError):

@@ -1,0 +1,51 @@
+"""JSON and YAML that somebody else wrote: plain data only, its size bounded."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from handeye_tri.errors import InputError, StorageError
+from handeye_tri.storage.files import read_bytes
+
+# More values than any file of poses has; an anchor that is repeated ten times ten
+# times over unfolds to more than any memory.
+_MAX_VALUES = 2_000_000
+
+
+def read_structured(path: Path) -> Any:
+    """Plain data of a JSON file (by its suffix) or a YAML file.
+
+    Raises:
+        StorageError: missing, or not readable.
+        InputError: it unfolds to more than it should.
+    """
+    from ruamel.yaml import YAML, YAMLError
+
+    kind = "JSON" if path.suffix == ".json" else "YAML"
+    try:
+        text = read_bytes(path).decode()
+        if kind == "JSON":
+            data = json.loads(text)
+        else:
+            data = YAML(typ="safe", pure=True).load(text)
+    except (YAMLError, RecursionError, LookupError, *_WRONG) as error:
+        first = (str(error).splitlines() or ["it is nested too deeply"])[0]
+        raise StorageError(f"{path}: this is not readable {kind} ({first})") from None
+    waiting, seen = [data], 0
+    while waiting:
+        node = waiting.pop()
+        seen += 1
+        if seen > _MAX_VALUES:
+            raise InputError(f"{path}: this unfolds to more than {_MAX_VALUES} values")
+        if isinstance(node, Mapping):
+            waiting.extend(node.values())
+        elif isinstance(node, list):
+            waiting.extend(node)
+    return data
+
+
+# What the parsers raise, beyond their own, for text, dates and keys that cannot be.
+_WRONG = (ValueError, TypeError, AttributeError, AssertionError, ArithmeticError)
