@@ -22,6 +22,7 @@ from handeye_tri.calibrate_cameras.assemble import (
     triangle_poses,
 )
 from handeye_tri.calibrate_cameras.bundle import bundle_cameras
+from handeye_tri.calibrate_cameras.bundle_input import observations
 from handeye_tri.calibrate_cameras.degeneracy import least_noise
 from handeye_tri.calibrate_cameras.general_motion_input import (
     check_enough,
@@ -33,6 +34,7 @@ from handeye_tri.calibrate_cameras.general_motion_views import (
     Views,
     epipolar_noise,
 )
+from handeye_tri.calibrate_cameras.half_turns import read_sigma
 from handeye_tri.calibrate_cameras.options import lens_choice
 from handeye_tri.camera import (
     LENS_COEFFICIENTS,
@@ -42,7 +44,7 @@ from handeye_tri.camera import (
     PinholeCamera,
 )
 from handeye_tri.errors import ConvergenceError, DegenerateMotionError, InputError
-from handeye_tri.records import CameraCalibration, Covariance
+from handeye_tri.records import CameraCalibration, Covariance, numeric
 from handeye_tri.se3 import SE3, se3_inverse
 from handeye_tri.triangle import TriangleRig
 
@@ -108,8 +110,8 @@ def calibrate_cameras_general(
     m = len(observed)
     labels, sizes = read_cameras(m, names, image_sizes, observed)
     noise_known = sigma_px is not None or covariance is not None
-    spread = _covariances(observed, sigma_px, covariance)
     check_enough(labels, observed)
+    spread = _covariances(observed, sigma_px, covariance)
 
     views = Views.of(observed, sizes, triangle)
     typical = float(np.sqrt(np.nanmedian(spread[..., [0, 1], [0, 1]])))
@@ -170,15 +172,11 @@ def _covariances(
 ) -> Floats:
     shape = (*observed.shape, 2)
     if covariance is None:
-        sigma = 1.0 if sigma_px is None else float(sigma_px)
-        if not (np.isfinite(sigma) and sigma > 0):
-            raise InputError(f"sigma_px must be a positive number, got {sigma_px}")
-        return np.broadcast_to(sigma**2 * np.eye(2), shape)
+        return np.broadcast_to(read_sigma(sigma_px) ** 2 * np.eye(2), shape)
     if sigma_px is not None:
         raise InputError("give either sigma_px or covariance, not both")
-    spread = np.asarray(covariance, dtype=float)
-    if spread.shape != shape:
-        raise InputError(f"covariance must have shape {shape}, got {spread.shape}")
+    spread = numeric("covariance", covariance)
+    observations(len(observed), observed, spread)
     return spread
 
 

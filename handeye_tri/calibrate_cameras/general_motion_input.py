@@ -8,9 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handeye_tri.errors import DegenerateMotionError, InputError
+from handeye_tri.records import numeric
 from handeye_tri.triangle import VERTICES
 
 Floats = NDArray[np.float64]
+
+# Markers that are nearer in most views cannot have been told apart, pixels.
+_MIN_DISTANCE = 0.5
 
 
 def read_points(points: ArrayLike) -> Floats:
@@ -19,7 +23,7 @@ def read_points(points: ArrayLike) -> Floats:
     Raises:
         InputError: the shape does not fit, or two markers are at one place.
     """
-    observed = np.array(points, dtype=float)
+    observed = numeric("points", points)
     if observed.ndim != 4 or observed.shape[2:] != (3, 2):
         raise InputError(
             "points must have shape (m, n, 3, 2): camera, view, marker A B C, (column, "
@@ -40,6 +44,15 @@ def read_points(points: ArrayLike) -> Floats:
             f"at the same pixel {observed[i, j, k].tolist()} ({len(same)} such pairs): "
             "one of them was found twice; put NaN where a marker was not found"
         )
+    for i, k in np.ndindex(len(observed), 3):
+        seen = apart[i, :, k][np.isfinite(apart[i, :, k])]
+        if len(seen) and np.median(seen) < _MIN_DISTANCE:
+            raise InputError(
+                f"points[{i}] has markers {VERTICES[k]} and {VERTICES[(k + 1) % 3]} "
+                f"less than {_MIN_DISTANCE} px apart in most of its {len(seen)} views "
+                f"(median {np.median(seen):.3f}): they are one marker found twice, or "
+                "the camera is too far away"
+            )
     return observed
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handeye_tri.errors import DegenerateMotionError, InputError
+from handeye_tri.records import numeric
 from handeye_tri.triangle import AXES, VERTICES, Axis, TriangleRig
 
 Floats = NDArray[np.float64]
@@ -153,7 +154,7 @@ def read_half_turns(
 def _pixels(before: ArrayLike, after: ArrayLike) -> Floats:
     both = []
     for name, value in (("before", before), ("after", after)):
-        array = np.asarray(value, dtype=float)
+        array = numeric(name, value)
         if array.ndim != 3 or array.shape[1:] != (3, 2):
             raise InputError(
                 f"{name} must have shape (n, 3, 2): half-turn, marker A B C, (column, "
@@ -174,6 +175,11 @@ def read_axes(axis: Axis | Sequence[Axis], n: int) -> tuple[Axis, ...]:
     Raises:
         InputError: their number does not fit, or a name is unknown.
     """
+    if not isinstance(axis, Sequence):
+        raise InputError(
+            f"axis must be one of {', '.join(AXES)}, or a sequence of them, one per "
+            f"half-turn; got {axis!r}"
+        )
     axes: tuple[Any, ...] = (axis,) * n if isinstance(axis, str) else tuple(axis)
     if len(axes) != n:
         raise InputError(
@@ -185,16 +191,27 @@ def read_axes(axis: Axis | Sequence[Axis], n: int) -> tuple[Axis, ...]:
     return axes
 
 
+def read_sigma(sigma_px: float | None) -> float:
+    """The standard deviation of pixel coordinates, one where it is not known.
+
+    Raises:
+        InputError: it is no positive number.
+    """
+    if sigma_px is None:
+        return 1.0
+    value = numeric("sigma_px", sigma_px)
+    if value.shape != () or not (np.isfinite(value) and value > 0):
+        raise InputError(f"sigma_px must be a positive number, got {sigma_px}")
+    return float(value)
+
+
 def _whitener(sigma_px: float | None, covariance: ArrayLike | None, n: int) -> Floats:
     shape = (n, 2, 3, 2, 2)
     if covariance is None:
-        sigma = 1.0 if sigma_px is None else float(sigma_px)
-        if not (np.isfinite(sigma) and sigma > 0):
-            raise InputError(f"sigma_px must be a positive number, got {sigma_px}")
-        return np.broadcast_to(np.eye(2) / sigma, shape).copy()
+        return np.broadcast_to(np.eye(2) / read_sigma(sigma_px), shape).copy()
     if sigma_px is not None:
         raise InputError("give either sigma_px or covariance, not both")
-    values = np.asarray(covariance, dtype=float)
+    values = numeric("covariance", covariance)
     if values.shape != shape:
         raise InputError(
             f"covariance must have shape {shape}: half-turn, before and after, marker, "

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from handeye_tri.calibrate_cameras.homography import ImageScale
 from handeye_tri.camera import INTRINSIC_NAMES, LENS_COEFFICIENTS, LensModel
 from handeye_tri.errors import InputError
+from handeye_tri.records import numeric
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +58,8 @@ class IntrinsicChoice:
         if not (np.nan_to_num(known[:2], nan=1.0) > 0).all():
             raise InputError(f"fixed focal lengths must be positive, got {fixed}")
         if aspect is not None:
-            if not (np.isfinite(aspect) and aspect > 0):
+            ratio = numeric("aspect", aspect)
+            if ratio.shape or not (np.isfinite(ratio) and ratio > 0):
                 raise InputError(f"aspect must be a positive fy / fx, got {aspect}")
             if np.isfinite(known[:2]).all():
                 raise InputError(
@@ -131,6 +133,10 @@ def split_fixed(
     Raises:
         InputError: a name is unknown or estimated too, or a value is not finite.
     """
+    if fixed is not None and not isinstance(fixed, Mapping):
+        raise InputError(
+            f"fixed must be names with their values, as {{'cx': 511.5}}; got {fixed!r}"
+        )
     names = LENS_COEFFICIENTS[model]
     lens = np.zeros(len(names))
     inner: dict[str, float] = {}
@@ -139,7 +145,7 @@ def split_fixed(
             raise InputError(
                 f"fixed[{name!r}] is none of {', '.join((*INTRINSIC_NAMES, *names))}"
             )
-        if not np.isfinite(value):
+        if numeric(f"fixed[{name!r}]", value).shape or not np.isfinite(value):
             raise InputError(f"fixed[{name!r}] must be a finite number, got {value}")
         if name in INTRINSIC_NAMES:
             inner[name] = float(value)

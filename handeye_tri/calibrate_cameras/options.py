@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from handeye_tri.calibrate_cameras.homography import OMode
 from handeye_tri.camera import LENS_COEFFICIENTS, LensModel
 from handeye_tri.errors import InputError
+from handeye_tri.records import numeric
 
 Floats = NDArray[np.float64]
 
@@ -36,6 +37,11 @@ def lens_choice(
                 f"names of coefficients, got {distortion!r}"
             )
         wanted = LENS_COEFFICIENTS[distortion]
+    elif not isinstance(distortion, Sequence):
+        raise InputError(
+            "distortion must be None, a lens model or a sequence of coefficients' "
+            f"names, got {distortion!r}"
+        )
     else:
         wanted = tuple(distortion)
     model: LensModel = (
@@ -65,7 +71,7 @@ def o_choice(o: Literal["shared", "free"] | ArrayLike) -> tuple[OMode, Floats | 
         if o == "free":
             return "free", None
         raise InputError(f'o must be "shared", "free" or two numbers, got {o!r}')
-    known = np.asarray(o, dtype=float)
+    known = numeric("o", o)
     if known.shape != (2,) or not np.isfinite(known).all():
         raise InputError(
             "a known o is the foot of the axis in the triangle's frame, shape (2,), "
@@ -96,7 +102,7 @@ def turn_covariances(
             "turn_covariance needs sigma_px or covariance beside it: metres cannot be "
             "weighed against pixels of unknown noise"
         )
-    matrix = np.asarray(value, dtype=float)
+    matrix = numeric("turn_covariance", value)
     if matrix.shape not in ((6, 6), (n, 6, 6)) or not np.isfinite(matrix).all():
         raise InputError(
             f"turn_covariance must be finite with shape (6, 6) or ({n}, 6, 6), "

@@ -374,7 +374,8 @@ def _refined(
         raise ConvergenceError(
             f"the refinement did not settle in {end.iterations} iterations (chi2 "
             f"{end.cost_start:.4g} to {end.cost:.4g} for {model.dof} degrees of "
-            "freedom); estimate fewer lens coefficients or add half-turns"
+            "freedom); check the triangle's sides and the axis, add half-turns, or "
+            "estimate fewer lens coefficients"
         )
     closed = starts.get("closed form")
     closed_cost = None if closed is None else model.evaluate(closed)

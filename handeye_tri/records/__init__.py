@@ -4,7 +4,7 @@ Indices: i counts the m cameras, j the n stations, k the markers A, B, C.
 Metres, radians and pixels inside; files and people get mm and degrees by name.
 """
 
-from handeye_tri.records.arrays import Floats, locked
+from handeye_tri.records.arrays import Floats, locked, numeric
 from handeye_tri.records.covariance import (
     MARKER_LABELS,
     MOTION_QUANTITIES,
@@ -38,6 +38,7 @@ from handeye_tri.records.session import (
 __all__ = [
     "Floats",
     "locked",
+    "numeric",
     "MARKER_LABELS",
     "MOTION_QUANTITIES",
     "Covariance",

@@ -12,6 +12,32 @@ from handeye_tri.errors import InputError
 Floats = NDArray[np.float64]
 
 
+def numeric(name: str, value: ArrayLike) -> Floats:
+    """A copy of what the caller gave, as an array of any shape.
+
+    Args:
+        name: What the message calls it.
+        value: Anything numpy reads as real numbers.
+
+    Raises:
+        InputError: it is something else: text, lists of unequal length, complex.
+    """
+    try:
+        array = np.array(value)
+        if array.dtype.kind in "biuf":
+            return array.astype(float)
+        if array.dtype.kind != "O":
+            raise TypeError
+        return array.astype(float)
+    except (TypeError, ValueError):
+        shown = repr(value)
+        if len(shown) > 60:
+            shown = shown[:57] + "..."
+        raise InputError(
+            f"{name} must be real numbers, in lists of equal length; got {shown}"
+        ) from None
+
+
 def locked(
     name: str, value: ArrayLike, shape: Sequence[int | None], *, finite: bool = True
 ) -> Floats:
@@ -26,7 +52,7 @@ def locked(
     Raises:
         InputError: the shape or a value does not fit.
     """
-    array: Floats = np.array(value, dtype=float)
+    array = numeric(name, value)
     fits = array.ndim == len(shape) and all(
         want is None or want == have
         for want, have in zip(shape, array.shape, strict=True)

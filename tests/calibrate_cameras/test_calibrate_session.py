@@ -7,11 +7,12 @@ from bundle_scene import LENS, errors, nees, observe, scene, true_motions
 
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
 from handeye_tri.calibrate_cameras.session_camera import turn_covariance
-from handeye_tri.errors import DegenerateMotionError, InputError
+from handeye_tri.errors import DegenerateMotionError, HandEyeError, InputError
 from handeye_tri.hand_eye import calibrate_hand_eye
 from handeye_tri.records import DroppedHalfTurn, Repeatability
 from handeye_tri.se3 import SE3, se3_adjoint, se3_exp, se3_inverse, se3_log, so3_exp
 from handeye_tri.synthesize import reference_geometry
+from handeye_tri.triangle import TriangleRig
 
 RADII = (0.0065, 0.008, 0.01)
 
@@ -278,6 +279,33 @@ class TestRefusals:
             calibrate_session_cameras(replace(session, pixels=pixels))
         for part in ("'right'", "only 2 of 4", "at least 3"):
             assert part in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("camera", "index", "value", "message"),
+        [
+            (1, np.s_[:], np.nan, "'right' saw all three.*only 0 of 8"),
+            (0, np.s_[:, 1], (300.0, 200.0), None),
+            (0, np.s_[:, 2], (9000.0, 5.0), "'left'.*outside the 1024 x 768 image"),
+        ],
+    )
+    def test_camera_whose_points_cannot_be_used(self, camera, index, value, message):
+        session, _ = observe(scene())
+        pixels = session.pixels.copy()
+        pixels[camera][index] = value
+        if message is None:
+            pixels[camera, :, 0] = pixels[camera, :, 1]
+            message = "'left': markers A and B before half-turn 0 are 0.000 px apart"
+        with pytest.raises((InputError, DegenerateMotionError), match=message):
+            calibrate_session_cameras(replace(session, pixels=pixels))
+
+    def test_wrong_image_size_and_wrong_triangle(self):
+        session, _ = observe(scene())
+        infos = tuple(replace(info, image_size=(100, 80)) for info in session.cameras)
+        with pytest.raises(InputError, match=r"'left'.*outside the 100 x 80 image"):
+            calibrate_session_cameras(replace(session, cameras=infos))
+        wrong = TriangleRig(1.0, 0.1, 0.3)
+        with pytest.raises(HandEyeError, match="camera 'left'.*triangle"):
+            calibrate_session_cameras(replace(session, triangle=wrong))
 
     def test_camera_that_shares_nothing(self):
         session, _ = observe(scene(half_turns=12))

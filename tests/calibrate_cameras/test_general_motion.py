@@ -178,6 +178,10 @@ def doubled(pixels):
     pixels[1, 5, 1] = pixels[1, 5, 0]
 
 
+def near(pixels):
+    pixels[:, :, 1] = pixels[:, :, 0] + 0.02
+
+
 def outside(pixels):
     pixels[1, 3, 2] = (2000.0, 5.0)
 
@@ -198,6 +202,16 @@ def apart(pixels):
         (outside, {}, InputError, r"points\[1, 3, 2\].*outside the 1024 x 768"),
         (parallel, {}, DegenerateMotionError, "3 views.*at least 4 views"),
         (apart, {}, HandEyeError, "camera2"),
+        (lambda p: {"pixels": "image"}, {}, InputError, "points must be real numbers"),
+        (lambda p: {"pixels": p * np.inf}, {}, InputError, "'camera0' saw no marker"),
+        (near, {}, InputError, r"points\[0\] has markers A and B less than 0.5 px"),
+        (None, {"sigma_px": "a"}, InputError, "sigma_px must be real numbers"),
+        (
+            None,
+            {"covariance": np.tile(-np.eye(2), (3, 22, 3, 1, 1))},
+            InputError,
+            r"covariance\[0, 0, 0\] must be symmetric and positive",
+        ),
         (None, {"names": ["a", "b"]}, InputError, "names must be 3"),
         (None, {"image_sizes": [(9, 9)] * 2}, InputError, "one or 3 of them"),
         (None, {"sigma_px": -1.0}, InputError, "sigma_px must be a positive"),
