@@ -53,11 +53,11 @@ def test_exact_data_give_the_exact_camera(axes, method, refine, o) -> None:
 
 
 @pytest.mark.parametrize("foot", [(0.0, 0.0), (0.13, 0.0), MIDDLE, (0.16, -0.03)])
-@pytest.mark.parametrize("o", ["shared", "free"])
+@pytest.mark.parametrize("o", ["shared", "free", "known"])
 @pytest.mark.parametrize("refine", [False, True])
 def test_axis_through_a_vertex_or_an_edges_middle(foot, o, refine) -> None:
     scene = make_scene(np.random.default_rng(2), 6, foot=foot)
-    result = calibrate(scene, o=o, refine=refine)
+    result = calibrate(scene, o=foot if o == "known" else o, refine=refine)
     error = result.camera.intrinsics.vector - scene.camera.intrinsics.vector
     assert np.abs(error).max() < 1e-7
 
@@ -78,6 +78,30 @@ def test_obtuse_and_thin_triangles(axis, triangle) -> None:
             - scene.camera.intrinsics.vector
         )
         assert np.abs(error).max() < 1e-7
+
+
+@pytest.mark.parametrize("axes", ["normal", "AB", "BC", "CA", MIXED])
+@pytest.mark.parametrize("refine", [False, True])
+@pytest.mark.parametrize("method", ["whitened", "paper"])
+@pytest.mark.parametrize(("n", "skew"), [(2, False), (3, False), (3, True)])
+def test_least_number_of_half_turns(axes, refine, method, n, skew) -> None:
+    axes = axes if isinstance(axes, str) else axes[:n]
+    view = camera(skew=1.5 if skew else 0.0)
+    scene = make_scene(np.random.default_rng(32), n, axes, view=view)
+    # Nothing but the ratios of the sides is known.
+    ratios = TriangleRig(1.0, TRIANGLE.side_ac / TRIANGLE.side_ab, TRIANGLE.angle)
+    result = calibrate_camera(
+        scene.before,
+        scene.after,
+        ratios,
+        image_size=IMAGE_SIZE,
+        axis=axes,
+        skew=skew,
+        refine=refine,
+        method=method,
+    )
+    error = result.camera.intrinsics.vector - scene.camera.intrinsics.vector
+    assert np.abs(error).max() < 1e-7
 
 
 def test_only_side_ratios_matter_for_k_and_sides_set_the_scale_of_poses() -> None:
@@ -245,6 +269,13 @@ def test_a_turn_of_179_degrees_shows_in_chi2_and_in_the_self_check(axis) -> None
     good = make_scene(np.random.default_rng(18), 11, axis)
     assert (calibrate(scene, *scene.noisy(rng, 0.1), sigma_px=0.1).chi2) > 10 * 60
     result = calibrate(good, *good.noisy(rng, 0.1), sigma_px=0.1)
+    if axis == "normal":
+        # Markers on an edge stay put whatever the angle; AA', BB', CC' do not meet.
+        bad = calibrate(scene, scene.before, scene.after, refine=False)
+        assert bad.details["self_check_px"].min() > 0.2
+        assert result.details["self_check_px"].max() < 0.5
+        exact = calibrate(good, good.before, good.after, refine=False)
+        assert exact.details["self_check_px"].max() < 1e-9
     # chi2 of about 60 degrees of freedom: 4 standard deviations.
     assert result.chi2 < result.dof + 4 * np.sqrt(2 * result.dof)
 
