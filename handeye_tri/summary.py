@@ -147,7 +147,11 @@ def _verdict(evaluation: Mapping[str, Any], remarks: Sequence[str]) -> list[str]
         f"({track['predicted_rms_mm']:.3f} predicted),",
         f"  {track['max_mm']:.3f} worst (station {track['worst_station']}, "
         f"marker {track['worst_marker']}).",
-        *(f"  {remark}" for remark in remarks),
+        *(
+            f"  {remark}"
+            for remark in (against_prediction_text(track), *remarks)
+            if remark
+        ),
         f"  Nearest to failing: {evaluation['nearest']}.",
         f"  {'gate':<32}{'found':<16}{'limit':<16}{'verdict':<10}blind to",
     ]
@@ -162,6 +166,22 @@ def _verdict(evaluation: Mapping[str, Any], remarks: Sequence[str]) -> list[str]
             f"    Do: {finding['remedy']}.",
         ]
     return lines
+
+
+def against_prediction_text(track: Mapping[str, Any]) -> str:
+    """Whether the track is as good as predicted, a sentence; empty where not known."""
+    found = track["against_prediction"]
+    if found is None:
+        return ""
+    words = {
+        "consistent": "Consistent with the prediction",
+        "better": "Better than predicted",
+        "worse": "Worse than predicted",
+    }
+    return (
+        f"{words[found['outcome']]}: 95 % of such tests have "
+        f"{found['low_mm']:.3f} to {found['high_mm']:.3f} mm rms."
+    )
 
 
 def tested_stations(track: Mapping[str, Any]) -> str:

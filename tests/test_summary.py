@@ -81,7 +81,8 @@ def evaluation(calibrated, **changes):
         "track": {
             "source": "held-out stations", "stations": 6,
             "mean_mm": 0.0712, "rms_mm": 0.08, "max_mm": 0.15,
-            "predicted_rms_mm": 0.082, "worst_station": 24, "worst_marker": "B",
+            "predicted_rms_mm": 0.082, "against_prediction": None,
+            "worst_station": 24, "worst_marker": "B",
             "predicted_parts_mm": {"calibration": 0.03, "pixels": 0.04, "robot": 0.0},
         },
         "robot": {"asked": [], "estimated": [], "undetermined": []},
@@ -179,3 +180,18 @@ def test_errors_of_the_robot_have_units_for_people(calibrated):
     assert rows["s.x"]["unit"] == "mm"
     assert rows["s.x"]["value"] == pytest.approx(0.2)
     assert rows["s.x"]["sigma"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "words"),
+    [
+        ("consistent", "Consistent with the prediction: 95 % of such tests have 0.050"),
+        ("better", "Better than predicted"),
+        ("worse", "Worse than predicted"),
+    ],
+)
+def test_the_track_is_judged_against_its_prediction(calibrated, outcome, words):
+    changed = evaluation(calibrated)
+    range_ = {"outcome": outcome, "low_mm": 0.05, "high_mm": 0.12}
+    changed["track"] = {**changed["track"], "against_prediction": range_}
+    assert words in summary_text(changed, Path("out"), [])

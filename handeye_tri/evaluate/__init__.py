@@ -9,7 +9,9 @@ from handeye_tri.evaluate.repeatability import (
     track_part,
 )
 from handeye_tri.evaluate.track import (
+    AgainstPrediction,
     LoopResiduals,
+    against_prediction,
     evaluate_track,
     loop_residuals,
     track_budget,
@@ -23,9 +25,11 @@ from handeye_tri.evaluate.workspace import (
 )
 
 __all__ = [
+    "AgainstPrediction",
     "Comparison",
     "CrossValidation",
     "LoopResiduals",
+    "against_prediction",
     "Spread",
     "TrackBudget",
     "TrackMap",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,43 @@ class LoopResiduals:
     rotation_max: float
 
 
+Outcome = Literal["consistent", "better", "worse"]
+
+
+@dataclass(frozen=True, slots=True)
+class AgainstPrediction:
+    """The held-out track error against the one that was predicted before the test.
+
+    Attributes:
+        outcome: "consistent" where the RMS lies in the range; else "better" or "worse"
+            than predicted.
+        low: Lower end of the range that holds 95 % of such tests, metres.
+        high: Its upper end.
+    """
+
+    outcome: Outcome
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """The rows of a track and what their errors come from.
+
+    Attributes:
+        track: The r rows.
+        parts: Covariance by calibration, pixels, robot, shape (3, r, 3, 3), m^2.
+        by_parameters: Derivative of observed less reported by the calibration's
+            parameters, shape (r, 3, p).
+        moved: Derivative of reported by the flange's right tangent, (r, 3, 6).
+    """
+
+    track: TrackEvaluation
+    parts: Floats
+    by_parameters: Floats
+    moved: Floats
+
+
 def loop_residuals(calibration: HandEyeCalibration) -> LoopResiduals:
     """Lengths of the hand-eye residuals, translation and rotation apart."""
     lengths = np.linalg.norm(calibration.residuals.reshape(-1, 2, 3), axis=2)
@@ -80,7 +118,7 @@ def evaluate_track(
         InputError: the cameras do not fit, nothing was seen by two of them, or
             robot_parameters are missing.
     """
-    return _evaluate(calibration, session, robot_parameters)[0]
+    return _evaluate(calibration, session, robot_parameters).track
 
 
 def track_budget(
@@ -89,22 +127,62 @@ def track_budget(
     robot_parameters: RobotParameters | None = None,
 ) -> TrackBudget:
     """Split the predicted track error, see :func:`evaluate_track`."""
-    _, parts, by_parameters = _evaluate(calibration, session, robot_parameters)
-    rms = np.sqrt(np.trace(parts, axis1=2, axis2=3).mean(axis=1)).tolist()
-    shares = calibration_parts(calibration, by_parameters)
+    rows = _evaluate(calibration, session, robot_parameters)
+    rms = np.sqrt(np.trace(rows.parts, axis1=2, axis2=3).mean(axis=1)).tolist()
+    shares = calibration_parts(calibration, rows.by_parameters)
     return TrackBudget(rms[0], rms[1], rms[2], shares)
+
+
+def against_prediction(
+    calibration: HandEyeCalibration,
+    session: Session,
+    robot_parameters: RobotParameters | None = None,
+) -> AgainstPrediction:
+    """Is the track as accurate as predicted? See :func:`evaluate_track`.
+
+    The sum of squared distances is a weighted sum of chi-squares, taken for a scaled
+    chi-square of the same mean and variance (Patnaik 1949,
+    doi:10.1093/biomet/36.1-2.202). Its variance, 2 tr(S^2), knows that all rows share
+    the calibration and the markers of a station share the robot's error; S, of all
+    rows, is never formed.
+    """
+    rows = _evaluate(calibration, session, robot_parameters)
+    track = rows.track
+    covariance = calibration.covariance.matrix
+    p = len(covariance)
+    # S = G C G' + D: G all derivatives, D the blocks of the stations.
+    every, weighed = np.zeros((p, p)), np.zeros((p, p))
+    square = 0.0
+    for station in np.unique(track.stations):
+        mine = np.flatnonzero(track.stations == station)
+        by_parameters = rows.by_parameters[mine].reshape(-1, p)
+        moved = rows.moved[mine].reshape(-1, 6)
+        own = moved @ session.repeatability.covariance @ moved.T
+        for k, row in enumerate(mine):
+            own[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += rows.parts[1, row]
+        every += by_parameters.T @ by_parameters
+        weighed += by_parameters.T @ own @ by_parameters
+        square += float((own * own).sum())
+    spread = covariance @ every
+    square += float((spread * spread.T).sum() + 2.0 * (covariance * weighed).sum())
+    mean = float(np.trace(rows.parts.sum(axis=0), axis1=1, axis2=2).sum())
+    half_dof = mean**2 / (2.0 * square)
+    # scipy.stats has the same quantiles but takes a second to import.
+    from scipy.special import gammaincinv
+
+    ends = mean / half_dof * gammaincinv(half_dof, [0.025, 0.975])
+    low, high = np.sqrt(ends / len(track.stations)).tolist()
+    outcome: Outcome = "consistent"
+    if not low <= track.rms <= high:
+        outcome = "better" if track.rms < low else "worse"
+    return AgainstPrediction(outcome, low, high)
 
 
 def _evaluate(
     calibration: HandEyeCalibration,
     session: Session,
     robot_parameters: RobotParameters | None,
-) -> tuple[TrackEvaluation, Floats, Floats]:
-    """The track; its covariance in parts (3, r, 3, 3): calibration, pixels, robot.
-
-    Last the derivative of observed less reported by the calibration's parameters,
-    (r, 3, p).
-    """
+) -> _Rows:
     names = [camera.name for camera in calibration.cameras]
     expected = [info.name for info in session.cameras]
     if names != expected:
@@ -139,7 +217,7 @@ def _evaluate(
         ]
     )
     track = TrackEvaluation(station, marker, reported, points[rows], parts.sum(axis=0))
-    return track, parts, by_parameters
+    return _Rows(track, parts, by_parameters, moved)
 
 
 def _reported_poses(

@@ -18,7 +18,12 @@ from handeye_tri.summary import result_rows
 if TYPE_CHECKING:
     from handeye_tri.adjustment import RobotParameters
     from handeye_tri.diagnose import Verdict
-    from handeye_tri.evaluate import CrossValidation, Spread, TrackBudget
+    from handeye_tri.evaluate import (
+        AgainstPrediction,
+        CrossValidation,
+        Spread,
+        TrackBudget,
+    )
     from handeye_tri.evaluate.resampling import Recalibrate
 
 # Calibrations from half-turns drawn again, and from noise drawn again. Each takes some
@@ -40,11 +45,14 @@ class JudgedTrack:
         budget: Where its predicted error comes from.
         cross_validation: Where the session has no held-out stations, what held them
             out in turn.
+        against_prediction: Whether the track is as good as predicted; None for
+            cross-validation, whose folds share most of their stations.
     """
 
     track: TrackEvaluation
     budget: TrackBudget
     cross_validation: CrossValidation | None
+    against_prediction: AgainstPrediction | None = None
 
 
 def judged_track(
@@ -54,7 +62,7 @@ def judged_track(
     progress: Callable[[int, int], None] | None = None,
 ) -> JudgedTrack:
     """The track at held-out stations; without any, cross-validation holds them out."""
-    from handeye_tri.evaluate import evaluate_track, track_budget
+    from handeye_tri.evaluate import against_prediction, evaluate_track, track_budget
     from handeye_tri.pipeline.robot import robot_parameters
 
     if len(session.indices("evaluation")):
@@ -63,6 +71,7 @@ def judged_track(
             evaluate_track(hand_eye, session, parameters),
             track_budget(hand_eye, session, parameters),
             None,
+            against_prediction(hand_eye, session, parameters),
         )
     result = _cross_validation(run, session, hand_eye, progress)
     return JudgedTrack(result.track, result.budget, result)
@@ -221,6 +230,13 @@ def track_json(judged: JudgedTrack) -> dict[str, Any]:
         "worst_station": int(track.stations[worst]),
         "worst_marker": "ABC"[track.markers[worst]],
         "predicted_rms_mm": 1e3 * track.predicted_rms,
+        "against_prediction": None
+        if judged.against_prediction is None
+        else {
+            "outcome": judged.against_prediction.outcome,
+            "low_mm": 1e3 * judged.against_prediction.low,
+            "high_mm": 1e3 * judged.against_prediction.high,
+        },
         "predicted_parts_mm": {
             name: 1e3 * value for name, value in judged.budget.parts().items()
         },

@@ -21,7 +21,7 @@ from handeye_tri.records import (
 )
 from handeye_tri.report import figures, geometry, spreads, tables
 from handeye_tri.report.figures import Photograph
-from handeye_tri.summary import tested_stations
+from handeye_tri.summary import against_prediction_text, tested_stations
 
 # So many of the worst views are shown as pictures.
 _CROPS = 6
@@ -127,6 +127,7 @@ def render_report(
         expectations=tables.expectations(origin.certificate, session, rows, parts),
         alternatives=tables.alternatives(calibration),
         tested_stations=tested_stations(evaluation["track"]),
+        against_prediction=against_prediction_text(evaluation["track"]),
         validation=evaluation["cross_checks"]["cross_validation"],
         spreads=spreads.spread_table(evaluation["cross_checks"]),
         unspread=spreads.not_run(evaluation["cross_checks"]),

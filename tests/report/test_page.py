@@ -103,6 +103,7 @@ def test_sections_are_in_order_verdict_first(html):
     numbers = [int(re.match(r"\d+", heading)[0]) for heading in headings]
     assert numbers == list(range(2, 12))
     assert html.index("<h1>PASS</h1>") < html.index("<h2>")
+    assert "Consistent with the prediction: 95 % of such tests" in html
 
 
 def test_identities_are_unique_across_figures(html):
