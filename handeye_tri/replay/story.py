@@ -121,8 +121,11 @@ def tell(
         InputError: the track is not of this session.
     """
     n = len(session.stations)
-    held_out = np.zeros(n, dtype=bool)
-    held_out[session.indices("evaluation")] = True
+    tested = session.indices("evaluation")
+    if len(tested) == 0:
+        # Each was held out of the calibration that its part of the track is by.
+        tested = np.unique(track.stations)
+    held_out = np.isin(np.arange(n), tested)
     if track.stations.max() >= n or not held_out[track.stations].all():
         raise InputError(
             "the track has stations that this session does not hold out; "

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from finished_session import finished
 
+from handeye_tri.adjustment import adjust
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
 from handeye_tri.errors import InputError
+from handeye_tri.evaluate import cross_validate
+from handeye_tri.evaluate.resampling import drawn
 from handeye_tri.replay.shapes import vertex_normals
 from handeye_tri.replay.story import (
     HalfTurnView,
@@ -118,6 +121,19 @@ def test_a_track_of_another_session_is_refused():
     other = replace(done.track, stations=np.zeros_like(done.track.stations))
     with pytest.raises(InputError, match="does not hold out"):
         tell(done.session, done.calibration, other, None)
+
+
+def test_without_held_out_stations_each_was_held_out_in_turn():
+    done = finished()
+    used = tuple(done.session.indices("calibration"))
+    session, _ = drawn(done.session, [used])
+    result = cross_validate(
+        session, lambda part, _index: adjust(part, done.calibration)
+    )
+    story = tell(session, done.calibration, result.track, None)
+    assert story.held_out.tolist() == [True] * 10
+    at = (result.track.stations, result.track.markers)
+    assert np.array_equal(story.observed[at], result.track.observed)
 
 
 def test_far_tracks_are_the_gaps_magnified():
