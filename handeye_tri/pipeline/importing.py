@@ -190,6 +190,8 @@ def _plan(
         rejected={},
         certificate={},
         seed=0,
+        outcome="CANNOT TELL",
+        findings=("the stations were imported, nothing was planned for them",),
     )
 
 
