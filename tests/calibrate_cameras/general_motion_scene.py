@@ -139,14 +139,25 @@ def errors(result, scene: Scene) -> Floats:
 
 
 def nees(result, scene: Scene) -> float:
-    """Normalised estimation error squared of the intrinsics, per unknown.
+    """Normalised estimation error squared of the intrinsics, per unknown."""
+    return _nees(result, scene, places=False)
 
-    Places are left out: a principal point that is uncertain by 50 px goes with a
-    rotation that is uncertain by degrees, and the curvature of that pair would be
-    scored, not the estimate.
+
+def nees_of_places(result, scene: Scene) -> float:
+    """The same of where the cameras stand.
+
+    Apart from the intrinsics: a principal point that is uncertain by 50 px goes with a
+    rotation that is uncertain by degrees, and together the curvature of that pair
+    would be scored, not the estimate.
     """
+    return _nees(result, scene, places=True)
+
+
+def _nees(result, scene: Scene, places: bool) -> float:
     labels = result.covariance.labels
-    kept = [i for i, label in enumerate(labels) if not label.startswith("reference")]
+    kept = [
+        i for i, label in enumerate(labels) if label.startswith("reference") == places
+    ]
     error = errors(result, scene)[kept]
     matrix = result.covariance.matrix[np.ix_(kept, kept)]
     return float(error @ np.linalg.solve(matrix, error) / len(error))
