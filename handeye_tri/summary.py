@@ -208,16 +208,13 @@ def cross_check_lines(evaluation: Mapping[str, Any]) -> list[str]:
             f"Cross-validation, {what}: {validation['rms_mm']:.3f} mm rms "
             f"({validation['predicted_rms_mm']:.3f} predicted)."
         )
-    parts = evaluation["track"]["predicted_parts_mm"]
-    stated = math.sqrt(
-        sum(parts[name] ** 2 for name in parts if name not in ("pixels", "robot"))
-    )
     drawn = checks["bootstrap"]
     if "not_run" in drawn:
         lines.append(f"Repeatability not run: {drawn['not_run']}")
     else:
         lines.append(
-            f"Calibration's part: {stated:.3f} mm by covariance, "
+            f"Calibration's part: {drawn['track_calibration_by_covariance_mm']:.3f} mm "
+            "by covariance, "
             f"{drawn['track_calibration_mm']:.3f} +- "
             f"{100 * drawn['relative_error']:.0f} % by drawing its "
             f"{drawn['drawn_from']} half-turns again."

@@ -141,7 +141,7 @@ def plan_board(cell: Cell, arm: Arm, stations: int, seed: int) -> Plan:
                 pose = SE3(arm.forward(free[0][None])[0])
                 found.append(Station(len(found), "calibration", free[0], pose))
             if len(found) == stations:
-                return Plan(tuple(found), (), {}, {}, seed)
+                return Plan(tuple(found), (), {}, {}, seed, "PASS", ())
     raise NoPlanError(f"only {len(found)} of {stations} board poses are reachable", {})
 
 

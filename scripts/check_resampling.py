@@ -71,7 +71,7 @@ def one(seed: int, half_turns: int, axis: str, replicates: int) -> dict[str, flo
         "noise": np.mean(
             np.array([noise.covariance.std(n) for n in labels]) ** 2 / sigma**2
         ),
-        "track part": (track_part(drawn, whole, session) / stated) ** 2,
+        "track part": (track_part(whole, session, drawn) / stated) ** 2,
         "validated": (validation.rms / validation.predicted_rms) ** 2,
         "held out": (track.rms / track.predicted_rms) ** 2,
         "seconds": seconds,

@@ -193,6 +193,7 @@ def _cross_checks(done: Finished) -> dict[str, Any]:
         "bootstrap": {
             **{"replicates": 60, "failed": 0, "drawn_from": 5, "relative_error": 0.37},
             **{"track_calibration_mm": 0.0456, "rms_ratio_to_covariance": 1.25},
+            "track_calibration_by_covariance_mm": 0.0365,
             "sigma": {label: 1.25 * value for label, value in sigma.items()},
             "sigma_by_covariance": sigma,
         },

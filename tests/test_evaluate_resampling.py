@@ -186,7 +186,7 @@ def test_bootstrap_of_half_turns_agrees_with_the_covariance():
         )
         found.append(ratios(spread, whole) ** 2)
         track.append(
-            track_part(spread, whole, session)
+            track_part(whole, session, spread)
             / track_budget(whole, session).calibration
         )
     assert 0.75 < np.sqrt(np.mean(found)) < 1.4
@@ -210,7 +210,7 @@ def test_resampling_is_the_seed_s_alone():
     np.testing.assert_array_equal(one.covariance.matrix, same.covariance.matrix)
     assert (one.covariance.matrix != other.covariance.matrix).any()
     # Without held-out stations its part of the track error is that at all stations.
-    assert 1e-6 < track_part(one, whole, session) < 1e-3
+    assert 1e-6 < track_part(whole, session, one) < 1e-3
 
 
 def test_too_little_data_for_resampling_is_said():

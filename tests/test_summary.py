@@ -76,6 +76,7 @@ def evaluation(calibrated, **changes):
             "bootstrap": {
                 "drawn_from": 11, "relative_error": 0.2431,
                 "track_calibration_mm": 0.0327,
+                "track_calibration_by_covariance_mm": 0.0301,
             },
         },
         "track": {

@@ -242,20 +242,26 @@ def _change(whole: HandEyeCalibration, other: HandEyeCalibration) -> dict[str, f
 
 
 def track_part(
-    spread: Spread,
     calibration: HandEyeCalibration,
     session: Session,
+    spread: Spread | None = None,
     robot_parameters: RobotParameters | None = None,
 ) -> float:
-    """The calibration's part of the track error by resampling, RMS in metres.
+    """The calibration's part of the track error, RMS in metres.
 
-    It stands beside :attr:`TrackBudget.calibration`, at the same places: the
-    session's held-out stations, or all its stations where it has none.
+    Places are the session's held-out stations, or all its stations where it has none.
+
+    Args:
+        calibration: Of the session.
+        session: Where the track is.
+        spread: Takes the place of the calibration's own covariance.
+        robot_parameters: Those with which the calibration was made.
     """
     places = session
     if len(session.indices("evaluation")) == 0:
         places = held_out(session, session.indices("calibration").tolist())
-    labels = calibration.covariance.labels
-    covariance = Covariance(labels, spread.covariance.block(labels))
-    resampled = replace(calibration, covariance=covariance)
-    return track_budget(resampled, places, robot_parameters).calibration
+    if spread is not None:
+        labels = calibration.covariance.labels
+        covariance = Covariance(labels, spread.covariance.block(labels))
+        calibration = replace(calibration, covariance=covariance)
+    return track_budget(calibration, places, robot_parameters).calibration

@@ -359,7 +359,9 @@ def _spread_json(
         "failed": spread.failed,
         "drawn_from": spread.units,
         "relative_error": spread.relative_error,
-        "track_calibration_mm": 1e3 * track_part(spread, hand_eye, session, parameters),
+        "track_calibration_mm": 1e3 * track_part(hand_eye, session, spread, parameters),
+        "track_calibration_by_covariance_mm": 1e3
+        * track_part(hand_eye, session, None, parameters),
         "rms_ratio_to_covariance": float(np.sqrt(np.mean((found / stated) ** 2))),
         "sigma": dict(zip(labels, found.tolist(), strict=True)),
         "sigma_by_covariance": dict(zip(labels, stated.tolist(), strict=True)),

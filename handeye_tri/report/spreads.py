@@ -68,5 +68,6 @@ def _note(name: str, check: Mapping[str, Any]) -> str:
         f"each sigma is known to {100 * check['relative_error']:.0f} %; over all "
         f"quantities {check['rms_ratio_to_covariance']:.2f} times the covariance's; "
         f"the calibration's part of the track error "
-        f"{check['track_calibration_mm']:.3f} mm."
+        f"{check['track_calibration_mm']:.3f} mm "
+        f"({check['track_calibration_by_covariance_mm']:.3f} by the covariance)."
     )
