@@ -38,7 +38,7 @@ from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
 from handeye_tri.evaluate import evaluate_track
 from handeye_tri.hand_eye import calibrate_hand_eye, solve_axxb, solve_axzb
 from handeye_tri.hand_eye.motions import relative_motions
-from handeye_tri.pipeline import NullProgress, Run
+from handeye_tri.pipeline import STAGES, NullProgress, Run, execute, start
 from handeye_tri.records import (
     MARKER_LABELS,
     Covariance,
@@ -48,7 +48,6 @@ from handeye_tri.records import (
     motion_labels,
 )
 from handeye_tri.se3 import SE3, so3_exp
-from handeye_tri.storage import SessionFolder
 
 # OpenCV's names, and this project's of the same method.
 RELATIVE = {
@@ -292,14 +291,9 @@ def one(name, seed, folder, peer):
     if kept.is_file() and (old := json.loads(kept.read_text()))["solvers"] == by:
         return old
     balls = folder / f"{name}_{seed}" / "balls"
-    done = subprocess.run(
-        [sys.executable, "-m", "handeye_tri.cli", "run", name, "-o", str(balls),
-         "--seed", str(seed)],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    if done.returncode not in (0, 3, 4):
-        raise SystemExit(f"{balls}: {done.stderr}")
-    run = Run(SessionFolder.open(balls), NullProgress())
+    run = Run(start(name, balls, seed, None), NullProgress())
+    with run.folder.locked():
+        execute(run, STAGES, ("plan", "simulate", "detect", "calibrate"), again=False)
     session, truth = run.session(), run.truth()[0]
     scores = {
         "three balls, joint": score(run.hand_eye(), session, truth),
