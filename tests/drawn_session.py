@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import atexit
 import shutil
+from contextlib import AbstractContextManager
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri import storage
 from handeye_tri.camera import PinholeCamera
-from handeye_tri.pipeline import STAGES, NullProgress, Run, execute, start
+from handeye_tri.pipeline import STAGES, NullProgress, Run, evaluation, execute, start
 from handeye_tri.pipeline.execution import inputs_of
 from handeye_tri.pipeline.run import TRUTH_SCHEMA
 from handeye_tri.simulate import execute as execute_plan
@@ -84,6 +86,13 @@ def _simulate(run: Run) -> list[str]:
     return outputs
 
 
+def few_replicates() -> AbstractContextManager[object]:
+    """Evaluate with few recalibrations: how they spread is tested elsewhere."""
+    return patch.object(
+        evaluation, "_REPLICATES", {"joint": (4, 4), "separate": (4, 4)}
+    )
+
+
 @cache
 def _made() -> Path:
     parent = Path(mkdtemp(prefix="drawn-"))
@@ -93,7 +102,8 @@ def _made() -> Path:
     execute(run, STAGES, ("plan",), again=False)
     stage = STAGES["simulate"]
     run.folder.record("simulate", inputs_of(run, stage), _simulate(run), "drawn")
-    execute(run, STAGES, ("detect", "calibrate", "evaluate"), again=False)
+    with few_replicates():
+        execute(run, STAGES, ("detect", "calibrate", "evaluate"), again=False)
     return folder
 
 
