@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         calibrate_camera,
         calibrate_cameras_general,
         calibrate_session_cameras,
+        calibrate_target_views,
         calibrate_trials,
     )
     from handeye_tri.camera import Intrinsics, Lens, PinholeCamera, StereoRig
@@ -56,6 +57,7 @@ _HOMES = {
     "calibrate_cameras_general": "calibrate_cameras",
     "calibrate_hand_eye": "hand_eye",
     "calibrate_session_cameras": "calibrate_cameras",
+    "calibrate_target_views": "calibrate_cameras",
     "calibrate_trials": "calibrate_cameras",
     "evaluate_track": "evaluate",
     "solve_axxb": "hand_eye",
@@ -82,6 +84,7 @@ __all__ = [
     "calibrate_cameras_general",
     "calibrate_hand_eye",
     "calibrate_session_cameras",
+    "calibrate_target_views",
     "calibrate_trials",
     "evaluate_track",
     "solve_axxb",

@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 _START_DAMPING = 1e-4
 _MAX_DAMPING = 1e12
 # (step / sigma)^2 of the last step taken; the one after would be its square.
-_RELATIVE_TOLERANCE = 1e-9
+RELATIVE_TOLERANCE = 1e-9
 # Minima whose costs differ by a smaller part than this are one minimum.
 _SAME_COST = 1e-3
 
@@ -133,13 +133,17 @@ class NormalEquations:
         own_scale, shared_scale = own_diagonal.copy(), shared_diagonal.copy()
         own_diagonal *= 1.0 + damping
         shared_diagonal *= 1.0 + damping
+        # With L L' = own, L^-1 of the right sides makes what is subtracted a square,
+        # of which only one half need be multiplied out.
+        inverse = np.linalg.inv(np.linalg.cholesky(own))
         right = np.concatenate([self.cross, self.own_gradient[..., None]], axis=-1)
-        solved = np.linalg.solve(own, right)
-        reduced = np.tensordot(self.cross, solved, axes=((0, 1), (0, 1)))
+        rows = (inverse @ right).reshape(-1, g + 1)
+        reduced = rows.T @ rows
         d_shared = -np.linalg.solve(
-            shared - reduced[:, :g], self.shared_gradient - reduced[:, g]
+            shared - reduced[:g, :g], self.shared_gradient - reduced[:g, g]
         )
-        d_own = -solved[..., g] - solved[..., :g] @ d_shared
+        rest = (rows[:, g] + rows[:, :g] @ d_shared).reshape(*inverse.shape[:2], 1)
+        d_own = -(np.swapaxes(inverse, -1, -2) @ rest)[..., 0]
         gain = (
             damping * float(np.vdot(own_scale, d_own**2))
             + damping * float(shared_scale @ d_shared**2)
@@ -192,6 +196,8 @@ def minimise(
     rounding: float,
     known: float | None = None,
     max_iterations: int = 100,
+    tolerance: float = RELATIVE_TOLERANCE,
+    damping: float = _START_DAMPING,
 ) -> Minimum[State, Rows] | None:
     """Levenberg-Marquardt with Nielsen's damping rule (IMM-REP-1999-05).
 
@@ -203,6 +209,8 @@ def minimise(
         known: Cost of a minimum found before. The iteration ends, not converged,
             where a short step is predicted to reach the same cost.
         max_iterations: Upper limit of evaluations.
+        tolerance: Predicted gain over cost per degree of freedom of a last step.
+        damping: Of the first step.
 
     Returns:
         The minimum; None where the start cannot be evaluated.
@@ -214,7 +222,7 @@ def minimise(
     cost_start = cost
     freedom = max(blocks.observations - blocks.unknowns, 1)
     floor = blocks.observations * rounding**2
-    damping, growth = _START_DAMPING, 2.0
+    growth = 2.0
     equations = blocks.equations()
     converged = False
     iteration = 0
@@ -225,7 +233,7 @@ def minimise(
         except np.linalg.LinAlgError:
             damping, growth = damping * growth, 2 * growth
             continue
-        negligible = gain <= max(_RELATIVE_TOLERANCE * cost / freedom, floor)
+        negligible = gain <= max(tolerance * cost / freedom, floor)
         if (
             known is not None
             and gain < 0.1 * known

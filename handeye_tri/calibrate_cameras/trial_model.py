@@ -218,7 +218,7 @@ class TrialModel:
             to_v = (fy * bent.x_by_y, fy * bent.y_by_y)
             by_lens = [
                 (fx * along_x + skew * along_y, fy * along_y)
-                for along_x, along_y in (bent.by_lens[k] for k in self.lens)
+                for along_x, along_y in (bent.by_lens[:, k] for k in self.lens)
             ]
         result = []
         for image, factors in enumerate((to_u, to_v)):

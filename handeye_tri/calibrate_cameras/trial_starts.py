@@ -74,7 +74,9 @@ def _solve_2x2(xx: Floats, xy: Floats, yy: Floats, u: Floats, v: Floats) -> Floa
     return np.stack([(yy * u - xy * v) / determinant, (xx * v - xy * u) / determinant])
 
 
-def linear_homographies(plane: Floats, image: Floats) -> Floats:
+def linear_homographies(
+    plane: Floats, image: Floats, seen: Floats | None = None
+) -> Floats:
     """Direct linear homographies of flat targets, (3, 3, n, c), last element 1.
 
     The first two rows are eliminated from the normal equations, which leaves three by
@@ -83,17 +85,18 @@ def linear_homographies(plane: Floats, image: Floats) -> Floats:
     Args:
         plane: Coordinates of about unit size around 0, shape (2, p, n, c) or (.., 1).
         image: The same of the images, shape (2, p, n, c).
+        seen: 1 for points that count and 0 for others, (p, n, c); None for all.
     """
     x, y = plane
     u, v = image
-    terms = (x * x, x * y, x, y * y, y)
-    one = float(plane.shape[1])
+    terms = (x * x, x * y, x, y * y, y, np.ones_like(x))
+    if seen is not None:
+        terms = tuple(term * seen for term in terms)
 
     def moments(weight: Floats | None) -> Floats:
         sums = [(t if weight is None else t * weight).sum(axis=0) for t in terms]
-        last = np.full(sums[0].shape, one) if weight is None else weight.sum(axis=0)
-        xx, xy, x1, yy, y1 = sums
-        return np.stack([[xx, xy, x1], [xy, yy, y1], [x1, y1, last]])
+        xx, xy, x1, yy, y1, one = sums
+        return np.stack([[xx, xy, x1], [xy, yy, y1], [x1, y1, one]])
 
     inverse = _inverse_3x3(moments(None))
     by_u, by_v = moments(u), moments(v)
@@ -176,6 +179,19 @@ def intrinsics_from_homographies(
     return np.stack([fx, fy, s, s * cy / fy - w13 * fx * fx / size, cy])
 
 
+def usable_intrinsics(unit: Floats) -> NDArray[np.bool_]:
+    """Which closed forms are a camera rather than noise, shape (c,).
+
+    Args:
+        unit: Shape (5, c), in units of the image's longer side, from its middle.
+    """
+    focal, off = unit[:2], np.abs(unit[3:]).max(axis=0)
+    good = (focal > _FOCAL_RANGE[0]).all(axis=0)
+    good &= (focal < _FOCAL_RANGE[1]).all(axis=0) & (off < _MAX_OFF_CENTRE)
+    ratio = focal[0] / np.where(good, focal[1], 1.0)
+    return np.asarray(good & (ratio > 1.0 / _MAX_ASPECT) & (ratio < _MAX_ASPECT))
+
+
 def poses_from_homographies(
     intrinsics: Floats, homographies: Floats
 ) -> tuple[Floats, Floats]:
@@ -225,10 +241,7 @@ def closed_form_start(
         o = _feet(model, observed, known_o)
         homographies, origin, size = _homographies(model, observed, o)
         found = intrinsics_from_homographies(homographies, model.weight, skew)
-        focal, off = found[:2], np.abs(found[3:]).max(axis=0)
-        good = (focal > _FOCAL_RANGE[0]).all(axis=0)
-        good &= (focal < _FOCAL_RANGE[1]).all(axis=0) & (off < _MAX_OFF_CENTRE)
-        good &= np.abs(np.log(focal[0] / focal[1])) < np.log(_MAX_ASPECT)
+    good = usable_intrinsics(found)
     generic = np.array([GENERIC_FOCAL, GENERIC_FOCAL, 0.0, 0.0, 0.0])[:, None]
     unit = np.where(good, found, generic)
     return _state(model, unit, homographies, origin, size, image, o), ~good

@@ -157,7 +157,7 @@ class Distorted:
         x_by_x: Derivative of x by the ideal x; of y by the ideal y: ``y_by_y``.
         x_by_y: Of x by the ideal y, and of y by the ideal x.
         y_by_y: See ``x_by_x``.
-        by_lens: Derivatives of x and y by each coefficient, (5 or 8) pairs.
+        by_lens: Derivatives of x and y by each coefficient, shape (2, 5 or 8, ...).
     """
 
     x: Floats
@@ -165,7 +165,7 @@ class Distorted:
     x_by_x: Floats
     x_by_y: Floats
     y_by_y: Floats
-    by_lens: tuple[tuple[Floats, Floats], ...]
+    by_lens: Floats
 
 
 def distort_components(coefficients: Floats, x: Floats, y: Floats) -> Distorted:
@@ -181,25 +181,28 @@ def distort_components(coefficients: Floats, x: Floats, y: Floats) -> Distorted:
     square = xx + yy
     radial, slope, denominator = _radial(coefficients, square)
     slope = slope + slope
-    twice, by_p1, by_p2 = xy + xy, square + 2 * xx, square + 2 * yy
-    powers = square if denominator is None else square / denominator
-    by_lens = []
-    for _ in range(3):
-        by_lens.append((x * powers, y * powers))
-        powers = powers * square
-    k1, k2, k3 = by_lens
-    pairs = [k1, k2, (twice, by_p2), (by_p1, twice), k3]
+    by_lens = np.empty((2, len(coefficients), *square.shape))
+    twice = np.add(xy, xy, out=by_lens[0, 2])
+    by_lens[1, 3] = twice
+    by_p1 = np.add(square + xx, xx, out=by_lens[0, 3])
+    by_p2 = np.add(square + yy, yy, out=by_lens[1, 2])
+    power = square if denominator is None else square / denominator
+    for k in (0, 1, 4):
+        np.multiply(x, power, out=by_lens[0, k])
+        np.multiply(y, power, out=by_lens[1, k])
+        power = power * square
     if len(coefficients) == 8:
-        pairs += [(-radial * u, -radial * v) for u, v in (k1, k2, k3)]
+        np.multiply(-radial, by_lens[:, [0, 1, 4]], out=by_lens[:, 5:])
     tilt = p1 * y + p2 * x
-    middle = radial + tilt + tilt
+    tilt += tilt
+    middle = radial + tilt
     return Distorted(
         x * radial + p1 * twice + p2 * by_p1,
         y * radial + p2 * twice + p1 * by_p2,
         middle + xx * slope + 4 * p2 * x,
         xy * slope + 2 * (p1 * x + p2 * y),
         middle + yy * slope + 4 * p1 * y,
-        tuple(pairs),
+        by_lens,
     )
 
 
@@ -221,9 +224,7 @@ def distort_jacobians(
     by_ideal = np.empty((*xy.shape, 2))
     by_ideal[..., 0, 0], by_ideal[..., 1, 1] = found.x_by_x, found.y_by_y
     by_ideal[..., 0, 1] = by_ideal[..., 1, 0] = found.x_by_y
-    by_lens = np.empty((*xy.shape, len(coefficients)))
-    for k, (by_x, by_y) in enumerate(found.by_lens):
-        by_lens[..., 0, k], by_lens[..., 1, k] = by_x, by_y
+    by_lens = np.moveaxis(found.by_lens, (0, 1), (-2, -1))
     return np.stack([found.x, found.y], axis=-1), by_ideal, by_lens
 
 

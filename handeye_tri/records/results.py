@@ -28,7 +28,8 @@ class CameraCalibration:
         chi2: Sum of squared whitened residuals.
         dof: Observations less unknowns; chi2 / dof is 1 for noise as assumed.
         residuals: Detected less predicted, px, NaN where unseen; shape
-            (m, views, 3, 2), the views in the order that the function documents.
+            (m, views, p, 2), p the points of a target (3 of a triangle), the views in
+            the order that the function documents.
         condition: Condition number of the scaled normal matrix.
         cost_start: chi2 of the closed form.
         method: How this was reached.
@@ -54,7 +55,9 @@ class CameraCalibration:
                 f"{m} cameras need as many motions, "
                 f"got {len(self.reference_from_camera)}"
             )
-        residuals = locked("residuals", self.residuals, (m, None, 3, 2), finite=False)
+        residuals = locked(
+            "residuals", self.residuals, (m, None, None, 2), finite=False
+        )
         object.__setattr__(self, "residuals", residuals)
 
     @property
