@@ -1,0 +1,173 @@
+"""A planned programme as files that a robot can run: joint moves and stops."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.errors import InputError
+
+Floats = NDArray[np.float64]
+
+PROGRAMME_SCHEMA = "handeye_tri.programme/1"
+# Speed of a joint whose model gives none, rad/s or m/s.
+_UNKNOWN_SPEED = 1.0
+# Radius within which a URScript move may cut the corner at a point it passes, metres.
+_BLEND = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Programme:
+    """Stations in the order driven, and the joint moves between them.
+
+    Attributes:
+        head: What a reader of the file must know, a line each.
+        joint_names: Of the arm's q joints.
+        slides: Which of them slide, shape (q,).
+        home: Where the programme starts, shape (q,), rad or m.
+        stops: Joints of the stations, shape (n, q), rad or m.
+        kinds: "calibration" or "evaluation", by station.
+        via: Joints passed on the way to each station, shapes (k, q), straight in
+            joint space from one to the next; k is 0 where the way is straight.
+        speed: Speed limits, shape (q,), rad/s or m/s; inf where unknown.
+        acceleration_time: From rest to full speed, seconds.
+        dwell: How long the robot stands at a station, seconds.
+    """
+
+    head: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    slides: NDArray[np.bool_]
+    home: Floats
+    stops: Floats
+    kinds: Sequence[str]
+    via: Sequence[Floats]
+    speed: Floats
+    acceleration_time: float
+    dwell: float
+
+    def __post_init__(self) -> None:
+        """Raise InputError where the dwell time is none."""
+        if not (np.isfinite(self.dwell) and self.dwell >= 0):
+            raise InputError(f"dwell must be 0 s or longer, got {self.dwell}")
+
+    @property
+    def limits(self) -> tuple[Floats, Floats]:
+        """Speed and acceleration limits by joint, shapes (q,)."""
+        speed = np.where(np.isfinite(self.speed), self.speed, _UNKNOWN_SPEED)
+        return speed, speed / self.acceleration_time
+
+    def leg(self, station: int) -> Floats:
+        """Where the way to a station leads, from the stop before, shape (k + 2, q)."""
+        start = self.stops[station - 1] if station else self.home
+        return np.concatenate([start[None], self.via[station], self.stops[[station]]])
+
+
+def programme_json(programme: Programme) -> str:
+    """The stations with their joints by name, rad or m."""
+    data = {
+        "schema": PROGRAMME_SCHEMA,
+        "notice": programme.head,
+        "joint_names": programme.joint_names,
+        "joint_units": ["m" if s else "rad" for s in programme.slides],
+        "dwell_s": programme.dwell,
+        "home": programme.home.tolist(),
+        "stations": [
+            {
+                "index": k,
+                "kind": kind,
+                "via": programme.via[k].tolist(),
+                "joints": programme.stops[k].tolist(),
+            }
+            for k, kind in enumerate(programme.kinds)
+        ],
+    }
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"
+
+
+def joint_trajectory_yaml(programme: Programme) -> str:
+    """A ROS 2 ``trajectory_msgs/msg/JointTrajectory`` message in YAML.
+
+    Every station is two points, arrival and departure. All points are at rest. A controller
+    joins points at rest by cubic polynomials that all joints pass through in step:
+    straight in joint space, with 1.5 times the mean speed in the middle and 6 times
+    the distance over the squared time at the ends. The times keep both in the limits.
+    """
+    lines = [f"# {line}" for line in programme.head]
+    lines += [
+        f"# Points at rest; {programme.dwell:g} s at each station. rad or m, seconds.",
+        "header:",
+        "  frame_id: ''",
+        f"joint_names: [{', '.join(programme.joint_names)}]",
+        "points:",
+        *_point(programme.home, 0.0),
+    ]
+    speed, acceleration = programme.limits
+    now = 0.0
+    for k in range(len(programme.stops)):
+        leg = programme.leg(k)
+        for start, end in pairwise(leg):
+            distance = np.abs(end - start)
+            slowest = np.maximum(
+                1.5 * distance / speed, np.sqrt(6 * distance / acceleration)
+            )
+            now += max(float(slowest.max()), 1e-3)
+            lines += _point(end, now)
+        if programme.dwell > 0:
+            now += programme.dwell
+            lines += _point(leg[-1], now)
+    return "\n".join(lines) + "\n"
+
+
+def _point(joints: Floats, time: float) -> list[str]:
+    seconds, rest = divmod(round(time * 1e9), 1_000_000_000)
+    values = ", ".join(repr(float(q)) for q in joints)
+    still = ", ".join(["0.0"] * len(joints))
+    return [
+        f"- positions: [{values}]",
+        f"  velocities: [{still}]",
+        f"  time_from_start: {{sec: {seconds}, nanosec: {rest}}}",
+    ]
+
+
+def urscript(programme: Programme) -> str:
+    """A URScript programme: moves, blended where they pass a point, and stops.
+
+    ``movej`` takes speed and acceleration of the joint that travels farthest; both
+    are chosen so that every joint stays within its own limits.
+
+    Raises:
+        InputError: the arm does not have six hinges.
+    """
+    if len(programme.joint_names) != 6 or programme.slides.any():
+        raise InputError(
+            "urscript needs an arm of six hinges, got "
+            f"{', '.join(programme.joint_names)}; choose csv, json or joint_trajectory"
+        )
+    speed, acceleration = programme.limits
+    lines = [f"# {line}" for line in programme.head]
+    lines += ["# Joints in rad, base to wrist.", "def calibration_programme():"]
+    start = _joints(programme.home)
+    lines += [f"  movej({start}, a={acceleration.min():.6g}, v={speed.min():.6g})"]
+    for k, kind in enumerate(programme.kinds):
+        lines.append(f"  # station {k}, {kind}")
+        leg = programme.leg(k)
+        for number, (start, end) in enumerate(pairwise(leg), 2):
+            share = np.abs(end - start) / max(float(np.abs(end - start).max()), 1e-12)
+            share = np.maximum(share, 1e-12)
+            blend = "" if number == len(leg) else f", r={_BLEND}"
+            lines.append(
+                f"  movej({_joints(end)}, a={(acceleration / share).min():.6g}, "
+                f"v={(speed / share).min():.6g}{blend})"
+            )
+        lines += [f'  textmsg("station ", {k})', f"  sleep({programme.dwell:g})"]
+    lines += ["end", "calibration_programme()"]
+    return "\n".join(lines) + "\n"
+
+
+def _joints(values: Floats) -> str:
+    return "[" + ", ".join(f"{q:.9f}" for q in values) + "]"

@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from handeye_tri.errors import InputError
+from handeye_tri.exchange.robot_programme import (
+    Programme,
+    joint_trajectory_yaml,
+    programme_json,
+    urscript,
+)
+
+RNG = np.random.default_rng(0)
+SPEED = np.array([3.5, 2.6, 3.3, 5.2, 5.2, 7.3])
+RAMP = 0.3
+PROGRAMME = Programme(
+    head=("made by a test",),
+    joint_names=tuple("slurbt"),
+    slides=np.zeros(6, dtype=bool),
+    home=np.zeros(6),
+    stops=RNG.uniform(-1.5, 1.5, (5, 6)),
+    kinds=("calibration",) * 4 + ("evaluation",),
+    via=[RNG.uniform(-1, 1, (k, 6)) for k in (0, 2, 0, 0, 1)],
+    speed=SPEED,
+    acceleration_time=RAMP,
+    dwell=0.5,
+)
+
+
+def way():
+    """All points driven through, stops and points between, shape (n, 6)."""
+    parts = [PROGRAMME.home[None]]
+    for via, stop in zip(PROGRAMME.via, PROGRAMME.stops, strict=True):
+        parts += [via, stop[None]]
+    return np.concatenate(parts)
+
+
+def test_json_holds_every_joint_exactly():
+    data = json.loads(programme_json(PROGRAMME))
+    assert data["joint_names"] == list("slurbt")
+    assert data["joint_units"] == ["rad"] * 6
+    joints = [data["home"]]
+    for station in data["stations"]:
+        joints += [*station["via"], station["joints"]]
+    np.testing.assert_array_equal(np.array(joints), way())
+    assert [s["kind"] for s in data["stations"]] == list(PROGRAMME.kinds)
+
+
+def test_joint_trajectory_stays_within_speed_and_acceleration():
+    data = YAML(typ="safe").load(joint_trajectory_yaml(PROGRAMME))
+    assert data["joint_names"] == list("slurbt")
+    points = np.array([p["positions"] for p in data["points"]])
+    assert not np.any([p["velocities"] for p in data["points"]])
+    times = np.array(
+        [
+            p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"]
+            for p in data["points"]
+        ]
+    )
+    span = np.diff(times)
+    assert (span > 0).all()
+    moving = np.abs(np.diff(points, axis=0)).max(axis=1) > 0
+    np.testing.assert_array_equal(points[np.r_[True, moving]], way())
+    assert (~moving).sum() == len(PROGRAMME.stops)
+    np.testing.assert_allclose(span[~moving], 0.5, atol=1e-8)
+    # The cubic between points at rest, sampled: speed and acceleration by joint.
+    s = np.linspace(0, 1, 201)
+    rate, bend = 6 * s * (1 - s), 6 - 12 * s
+    most = np.zeros((2, 6))
+    for start, end, seconds in zip(points[:-1], points[1:], span, strict=True):
+        travel = np.abs(end - start)[:, None]
+        speeds = (travel * rate / seconds).max(axis=1) / SPEED
+        bends = (travel * np.abs(bend) / seconds**2).max(axis=1) / (SPEED / RAMP)
+        assert max(speeds.max(), bends.max()) <= 1 + 1e-6
+        most = np.maximum(most, [speeds, bends])
+    # And no slower than needed: some joint is at its limit.
+    assert most.max() > 0.999
+
+
+def test_urscript_moves_no_joint_beyond_its_limits_and_stops_at_stations():
+    text = urscript(PROGRAMME)
+    pattern = r"movej\(\[(.*?)\], a=(\S+), v=([^,)]+)(, r=0.01)?\)"
+    moves = re.findall(pattern, text)
+    joints = np.array([[float(v) for v in m[0].split(",")] for m in moves])
+    # First to where the programme starts, from wherever the robot is.
+    np.testing.assert_allclose(joints, way(), atol=1e-9)
+    for start, move, end in zip(joints[:-1], moves[1:], joints[1:], strict=True):
+        travel = np.abs(end - start)
+        share = travel / travel.max()
+        assert (float(move[2]) * share <= SPEED * (1 + 1e-5)).all()
+        assert (float(move[1]) * share <= SPEED / RAMP * (1 + 1e-5)).all()
+    blended = sum(bool(m[3]) for m in moves)
+    assert blended == sum(len(via) for via in PROGRAMME.via)
+    assert text.count("sleep(0.5)") == len(PROGRAMME.stops)
+    assert text.startswith("# made by a test\n")
+    assert text.rstrip().endswith("end\ncalibration_programme()")
+
+
+def test_urscript_is_for_six_hinges():
+    slides = np.array([True] + [False] * 5)
+    with pytest.raises(InputError, match="six hinges, got s, l, u, r, b, t"):
+        urscript(replace(PROGRAMME, slides=slides))
+
+
+@pytest.mark.parametrize("dwell", [-1.0, np.nan])
+def test_dwell_must_be_a_time(dwell):
+    with pytest.raises(InputError, match="dwell must be 0 s or longer"):
+        replace(PROGRAMME, dwell=dwell)
+
+
+def test_joints_without_a_stated_speed_are_driven_slowly():
+    text = joint_trajectory_yaml(replace(PROGRAMME, speed=np.full(6, np.inf)))
+    slow = YAML(typ="safe").load(text)["points"][-1]["time_from_start"]["sec"]
+    quick = YAML(typ="safe").load(joint_trajectory_yaml(PROGRAMME))
+    assert slow > quick["points"][-1]["time_from_start"]["sec"]
