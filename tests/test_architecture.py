@@ -54,6 +54,7 @@ ENGINES = {
     "hppfcl": ("solids",),
     # The baselines of the experiments are OpenCV's.
     "cv2": ("detect", "experiments"),
+    "ompl": ("plan",),
     "rerun": ("replay",),
     "rerun_bindings": ("replay",),
 }

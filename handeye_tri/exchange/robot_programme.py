@@ -92,10 +92,11 @@ def programme_json(programme: Programme) -> str:
 def joint_trajectory_yaml(programme: Programme) -> str:
     """A ROS 2 ``trajectory_msgs/msg/JointTrajectory`` message in YAML.
 
-    Every station is two points, arrival and departure. All points are at rest. A controller
-    joins points at rest by cubic polynomials that all joints pass through in step:
-    straight in joint space, with 1.5 times the mean speed in the middle and 6 times
-    the distance over the squared time at the ends. The times keep both in the limits.
+    Every station is two points, arrival and departure. All points are at rest. A
+    controller joins points at rest by cubic polynomials that all joints pass through
+    in step: straight in joint space, with 1.5 times the mean speed in the middle and
+    6 times the distance over the squared time at the ends. The times keep both in
+    the limits.
     """
     lines = [f"# {line}" for line in programme.head]
     lines += [

@@ -16,8 +16,9 @@ from handeye_tri.plan.certificate import MIN_AXIS_SPREAD, certify
 from handeye_tri.plan.design import Design
 from handeye_tri.plan.information import EXPECTED_SIGMA_PX, StationInformation
 from handeye_tri.plan.poses import View, plane_angles
+from handeye_tri.plan.route import RoutePlanner
 from handeye_tri.plan.selection import Selector
-from handeye_tri.plan.sequence import Stops, shortest_order, travel_time
+from handeye_tri.plan.sequence import Stops
 from handeye_tri.records import HalfTurn, Plan, Station
 from handeye_tri.se3 import SE3
 
@@ -27,11 +28,10 @@ Progress = Callable[[int, int], None]
 # Half-turns to choose from, per half-turn wanted, and at most.
 _POOL = 90
 _LARGEST_POOL = 1000
-# Selections and, for each, paths that are tried before a cell is given up.
+# Selections that are tried before a cell is given up.
 _SELECTIONS = 6
-_PATHS = 400
-# Ways to reach a half-turn that the order may choose from.
-_OPTIONS = 6
+# Ways to reach a half-turn that the order may choose from, senses included.
+_OPTIONS = 12
 
 _REMEDY = {
     "tilt": "raise plan.max_tilt_deg or bring the cameras closer together",
@@ -123,6 +123,9 @@ class _Planner:
         self.progress = progress
         self.done = -1
         self.rejected: Counter[str] = Counter()
+        self.route = RoutePlanner(
+            arm, cell.arm.acceleration_time_s, seed, self.rejected
+        )
 
     def _done(self, done: int) -> None:
         if self.progress is not None and done > self.done:
@@ -136,22 +139,22 @@ class _Planner:
         )
         # Half of the work is in what comes after the pool.
         pool = search.prospects(self.pool_size, progress=lambda n: self._done(n // 2))
-        self.rejected = search.rejected
+        self.rejected = self.route.rejected = search.rejected
         if len(pool) < self.wanted:
             raise self._no_plan(
                 search.drawn, f"{len(pool)} of {self.wanted} half-turns found"
             )
-        chosen, bound = self._choose_and_order(pool, search)
+        chosen, via, bound = self._choose_and_order(pool, search)
         self._done(self.pool_size + self.wanted)
-        evaluation = self._evaluation(chosen[-1].joints[-1])
-        plan = self._record(chosen, evaluation, bound, len(pool))
+        evaluation, further = self._evaluation(chosen[-1].joints[-1])
+        plan = self._record(chosen, evaluation, [*via, *further], bound, len(pool))
         self._done(self.total)
         return plan
 
     def _choose_and_order(
         self, pool: Sequence[Prospect], search: CandidateSearch
-    ) -> tuple[list[Candidate], float]:
-        """The half-turns in their order, and the bound on their cost, m^2."""
+    ) -> tuple[list[Candidate], list[Floats], float]:
+        """The half-turns in their order, the ways there, the bound on their cost."""
         checks = 0
 
         def checked() -> None:
@@ -187,15 +190,17 @@ class _Planner:
             if chosen is None:
                 break
             order = self._order([search.all_free(pool[k]) for k in chosen])
-            if isinstance(order, list):
-                return order, selection.bound
+            if not isinstance(order, int):
+                return *order, selection.bound
             chosen = selector.replace(chosen, chosen[order])
         most = "path" if self.rejected["path"] else "plane_spread"
         raise self._no_plan(
             len(pool), "no order of half-turns drives free from one to the next", most
         )
 
-    def _order(self, ways: list[list[Candidate]]) -> list[Candidate] | int:
+    def _order(
+        self, ways: list[list[Candidate]]
+    ) -> tuple[list[Candidate], list[Floats]] | int:
         """The half-turns in the order of least time, or the one that is in the way.
 
         Planes of successive half-turns spread enough, and the straight path
@@ -218,70 +223,42 @@ class _Planner:
         end = np.array([c.joints[1] for c in options])
         normals = np.array([c.normal for c in options])
         spread = plane_angles(normals[:, None], normals[None]) >= least
-        times = np.where(spread, self._time(end[:, None], begin[None]), np.inf)
-        stops = Stops(stop, self._time(self.arm.home, begin), times)
-        order = self._drive(stops, begin, end)
-        if order is not None:
-            return [options[k] for k in order]
+        times = np.where(spread, self.route.time(end[:, None], begin[None]), np.inf)
+        stops = Stops(stop, self.route.time(self.arm.home, begin), times)
+        route = self.route.drive(stops, self.arm.home, begin, end)
+        if route is not None:
+            return [options[k] for k in route.order], route.via
         return int(np.argmin(np.bincount(stop, np.isfinite(times).sum(axis=1))))
 
-    def _time(self, start: Floats, end: Floats) -> Floats:
-        ramp = self.cell.arm.acceleration_time_s
-        return travel_time(start, end, self.arm.speed, ramp)
-
-    def _drive(self, stops: Stops, begin: Floats, end: Floats) -> list[int] | None:
-        """The order of least time whose straight paths are free, or None."""
-        known: set[tuple[int, int]] = set()
-        while len(known) < _PATHS:
-            order = shortest_order(stops)
-            if order is None:
-                self.rejected["plane_spread"] += 1
-                return None
-            blocked = False
-            for a, b in zip(order[:-1], order[1:], strict=True):
-                if (a, b) in known:
-                    continue
-                known.add((a, b))
-                if self.arm.path_collision(end[a], begin[b]) is not None:
-                    self.rejected["path"] += 1
-                    stops.times[a, b] = np.inf
-                    blocked = True
-            if not blocked:
-                return order
-        return None
-
-    def _evaluation(self, start: Floats) -> list[Candidate]:
+    def _evaluation(self, start: Floats) -> tuple[list[Candidate], list[Floats]]:
         """Stations anywhere in the workspace, in the order of least time."""
         wanted = self.cell.plan.evaluation_stations
         if wanted == 0:
-            return []
+            return [], []
         search = CandidateSearch(
             self.view, self.arm, np.random.default_rng([self.seed, 1])
         )
-        # Some more than wanted: a path may be blocked.
-        found = search.find(3 * wanted, turns=False)
+        # Some more than wanted: the way to one may be blocked.
+        found = search.find(2 * wanted, turns=False)
         self.rejected += search.rejected
-        reachable = [
-            c for c in found if self.arm.path_collision(start, c.joints[0]) is None
-        ]
-        self.rejected["path"] += len(found) - len(reachable)
-        while len(reachable) >= wanted:
-            some = reachable[:wanted]
-            joints = np.array([c.joints[0] for c in some])
-            times = self._time(joints[:, None], joints[None])
-            stops = Stops(np.arange(wanted), self._time(start, joints), times)
-            order = self._drive(stops, joints, joints)
-            if order is not None:
-                return [some[k] for k in order]
-            reachable.pop(int(np.argmin(np.isfinite(times).sum(axis=1))))
+        self.route.rejected = self.rejected
+        while len(found) >= wanted:
+            joints = np.array([c.joints[0] for c in found[:wanted]])
+            times = self.route.time(joints[:, None], joints[None])
+            stops = Stops(np.arange(wanted), self.route.time(start, joints), times)
+            route = self.route.drive(stops, start, joints, joints)
+            if route is not None:
+                return [found[k] for k in route.order], route.via
+            found.pop(int(np.argmin(np.isfinite(times).sum(axis=0))))
         raise self._no_plan(
-            search.drawn, f"{len(reachable)} of {wanted} evaluation stations found"
+            search.drawn, f"{len(found)} of {wanted} evaluation stations found"
         )
 
     def _record(
         self,
         chosen: list[Candidate],
         evaluation: list[Candidate],
+        ways: list[Floats],
         bound: float,
         pool: int,
     ) -> Plan:
@@ -306,10 +283,15 @@ class _Planner:
         certificate = dict(certified.numbers)
         certificate["relaxed_bound_mm"] = float(1e3 * np.sqrt(bound))
         certificate["candidates"] = float(pool)
+        via = self._via(ways, len(chosen))
+        joints = [s.joints for s in (*calibration, *held_out)]
         route = np.array(
-            [self.arm.home, *(s.joints for s in (*calibration, *held_out))]
+            [
+                self.arm.home,
+                *(q for v, s in zip(via, joints, strict=True) for q in (*v, s)),
+            ]
         )
-        times = self._time(route[:-1], route[1:])
+        times = self.route.time(route[:-1], route[1:])
         certificate["cycle_time_s"] = float(times.sum())
         if certificate["axis_spread"] < MIN_AXIS_SPREAD:
             self.rejected["axis_spread"] += 1
@@ -322,7 +304,14 @@ class _Planner:
             self.seed,
             certified.outcome,
             certified.findings,
+            via,
         )
+
+    def _via(self, ways: list[Floats], half_turns: int) -> tuple[Floats, ...]:
+        """Points to pass by station: a half-turn itself is driven straight."""
+        straight = np.zeros((0, len(self.arm.home)))
+        turns = [v for way in ways[:half_turns] for v in (way, straight)]
+        return (*turns, *ways[half_turns:])
 
     def _no_plan(self, drawn: int, what: str, check: str | None = None) -> NoPlanError:
         counts = {name: n for name, n in self.rejected.most_common() if n}

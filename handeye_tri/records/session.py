@@ -110,6 +110,8 @@ class Plan:
         outcome: PASS where the stations determine everything well enough, else FAIL
             or CANNOT TELL.
         findings: What is not determined well, and what to do; one sentence each.
+        via: Joints to pass on the way to each station, shapes (k, q), rad or m,
+            straight in joint space from one to the next; nothing given: no points.
     """
 
     stations: tuple[Station, ...]
@@ -119,6 +121,20 @@ class Plan:
     seed: int
     outcome: Literal["PASS", "FAIL", "CANNOT TELL"]
     findings: tuple[str, ...]
+    via: tuple[Floats, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Lock the points passed; raise InputError where they are not one a station."""
+        if not self.via:
+            straight = tuple(np.zeros((0, len(s.joints))) for s in self.stations)
+            object.__setattr__(self, "via", straight)
+        if len(self.via) != len(self.stations):
+            raise InputError(
+                f"via must have one array for each of {len(self.stations)} stations, "
+                f"got {len(self.via)}"
+            )
+        passed = tuple(locked("via", points, (None, None)) for points in self.via)
+        object.__setattr__(self, "via", passed)
 
 
 @dataclass(frozen=True, slots=True)

@@ -115,10 +115,11 @@ def plan_to_json(plan: Plan) -> Json:
             {
                 "index": s.index,
                 "kind": s.kind,
+                "via_rad_or_m": via.tolist(),
                 "joints_rad_or_m": s.joints.tolist(),
                 "base_from_flange": motion_to_json(s.base_from_flange),
             }
-            for s in plan.stations
+            for s, via in zip(plan.stations, plan.via, strict=True)
         ],
         "half_turns": [
             {"before": t.before, "after": t.after, "axis": t.axis}
@@ -152,6 +153,12 @@ def plan_from_json(data: Mapping[str, Any]) -> Plan:
         seed=int(data["seed"]),
         outcome=data["outcome"],
         findings=tuple(str(line) for line in data["findings"]),
+        via=tuple(
+            array(s["via_rad_or_m"], "via_rad_or_m").reshape(
+                -1, len(s["joints_rad_or_m"])
+            )
+            for s in data["stations"]
+        ),
     )
 
 

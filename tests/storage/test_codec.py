@@ -81,6 +81,7 @@ def test_plan():
         {"a_mm": 0.5},
         7,
     )
+    assert [via.shape for via in back.via] == [via.shape for via in plan.via]
     for ours, theirs in zip(back.stations, stations, strict=True):
         assert (ours.index, ours.kind) == (theirs.index, theirs.kind)
         assert np.array_equal(ours.joints, theirs.joints)
