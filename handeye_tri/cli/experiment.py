@@ -29,7 +29,7 @@ from handeye_tri.cli.progress import TimeLeft, cap_threads
 @click.option(
     "--images",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Chessboard views left01.jpg, right01.jpg ... for table1 and fig09.",
+    help="Chessboard views left01.jpg, right01.jpg ..., also for table1 and fig09.",
 )
 def experiment(
     name: str,

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.detect import search
+from handeye_tri.detect.corners import detect_corners, likeness
 from handeye_tri.detect.ellipse import Indices
 from handeye_tri.detect.identity import assign
 from handeye_tri.detect.markers import Detection, MarkerSpec, Reason, chroma
@@ -14,7 +15,14 @@ from handeye_tri.detect.sheet import detection_sheet
 from handeye_tri.errors import InputError
 from handeye_tri.records import Floats
 
-__all__ = ["Detection", "MarkerSpec", "detect_markers", "detection_sheet"]
+__all__ = [
+    "Detection",
+    "MarkerSpec",
+    "detect_corners",
+    "detect_markers",
+    "detection_sheet",
+    "likeness",
+]
 
 Image = NDArray[np.uint8]
 

@@ -22,6 +22,8 @@ _MIN_PART = 0.35
 _MIN_SAMPLES = 6
 # Grey markers are flat spots: a step of more levels than this is an edge.
 _EDGE_LEVELS = 14.0
+# A corner's response is at least this part of the strongest one's.
+_HARRIS_QUALITY = 0.0005
 # A larger part of the image's side is no marker.
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 _MAX_PART = 0.25
@@ -134,6 +136,40 @@ def flat_spots(image: Image, shrink: int) -> list[Candidate]:
         )
         for k in 1 + np.flatnonzero(round_)
     ]
+
+
+def harris_corners(
+    image: Image, mask: NDArray[np.bool_], apart: float, window: int
+) -> tuple[Floats, Floats]:
+    """Corners by Harris and Stephens (1988), at whole pixels and refined.
+
+    Args:
+        image: Grey, shape (h, w).
+        mask: Where to look, shape (h, w).
+        apart: Least distance of two corners, pixels.
+        window: Half width of what a corner is refined in, pixels.
+
+    Returns:
+        Where they were found and where refined, both of shape (n, 2), pixels.
+    """
+    found = cv2.goodFeaturesToTrack(
+        image,
+        0,
+        _HARRIS_QUALITY,
+        apart,
+        mask=mask.astype(np.uint8),
+        blockSize=5,
+        useHarrisDetector=True,
+        k=0.04,
+    )
+    if found is None:
+        return np.empty((0, 2)), np.empty((0, 2))
+    until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
+    refined = cv2.cornerSubPix(image, found.copy(), (window, window), (-1, -1), until)
+    return (
+        np.asarray(found, dtype=float).reshape(-1, 2),
+        np.asarray(refined, dtype=float).reshape(-1, 2),
+    )
 
 
 def grey(image: Image) -> Image:

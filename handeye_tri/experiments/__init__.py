@@ -13,11 +13,9 @@ if TYPE_CHECKING:
     from handeye_tri.experiments.outcome import Options, Outcome
 
 # In the order of the paper.
-NAMES = ("fig05", "fig06", "fig07", "table1", "fig09", "fig12", "fig13")
-# Those that need real views.
-ON_IMAGES = ("table1", "fig09")
+NAMES = ("fig05", "fig06", "fig07", "table1", "fig09", "fig10", "fig12", "fig13")
 
-__all__ = ["NAMES", "ON_IMAGES", "run_experiment", "run_paper"]
+__all__ = ["NAMES", "run_experiment", "run_paper"]
 
 
 def run_experiment(name: str, options: Options) -> Outcome:
@@ -33,7 +31,7 @@ def run_experiment(name: str, options: Options) -> Outcome:
 
 
 def run_paper(options: Options, tell: Callable[[Outcome], None]) -> list[Outcome]:
-    """Run all of NAMES, those on real views if there are some; write index.html.
+    """Run all of NAMES, and write them on one page, index.html.
 
     Args:
         options: How.
@@ -41,12 +39,10 @@ def run_paper(options: Options, tell: Callable[[Outcome], None]) -> list[Outcome
     """
     from handeye_tri.experiments.page import write_page
 
-    absent = ON_IMAGES if options.images is None else ()
     outcomes = []
     for name in NAMES:
-        if name not in absent:
-            outcomes.append(run_experiment(name, options))
-            tell(outcomes[-1])
-            # Written again each time: an interrupted run leaves what it has.
-            write_page(options.folder, outcomes, absent)
+        outcomes.append(run_experiment(name, options))
+        tell(outcomes[-1])
+        # Written again each time: an interrupted run leaves what it has.
+        write_page(options.folder, outcomes)
     return outcomes

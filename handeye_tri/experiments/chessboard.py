@@ -22,6 +22,9 @@ Floats = NDArray[np.float64]
 # Half width of the window in which a corner is refined, pixels. A larger one reaches
 # the next corner where the board is small in the image.
 _CORNER_WINDOW = 5
+_NO_LENS = (
+    cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+)
 _NAMES = re.compile(r"(left|right)_?(\d+)\.(?:png|jpe?g)")
 
 
@@ -88,7 +91,7 @@ def read_board_views(folder: Path, board: Board) -> BoardViews:
         for side in ("left", "right"):
             image = read_image(pair[side])
             sizes.add((image.shape[1], image.shape[0]))
-            both.append(_corners(image, board))
+            both.append(find_board(image, board))
         if all(seen is not None for seen in both):
             names.append(number)
             corners.append(both)
@@ -104,7 +107,13 @@ def read_board_views(folder: Path, board: Board) -> BoardViews:
     return BoardViews(board, tuple(names), sizes.pop(), pixels)
 
 
-def _corners(image: NDArray[np.uint8], board: Board) -> Floats | None:
+def find_board(image: NDArray[np.uint8], board: Board) -> Floats | None:
+    """Inner corners of a board that is seen whole, (rows * columns, 2), else None.
+
+    Args:
+        image: RGB, shape (h, w, 3), or grey, shape (h, w).
+        board: The chessboard.
+    """
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     whole, corners = cv2.findChessboardCorners(grey, (board.columns, board.rows))
     if not whole:
@@ -115,28 +124,31 @@ def _corners(image: NDArray[np.uint8], board: Board) -> Floats | None:
     return np.asarray(refined, dtype=float).reshape(-1, 2)
 
 
-def zhang(views: BoardViews, side: int) -> PinholeCamera:
-    """One camera by Zhang's method as OpenCV has it, with k1 k2 p1 p2 k3.
+def zhang(views: BoardViews, side: int, *, lens: bool = True) -> PinholeCamera:
+    """One camera by Zhang's method as OpenCV has it, with k1 k2 p1 p2 k3 or no lens.
 
     Zhang 2000, doi:10.1109/34.888718: every corner of every view, one pose a view.
 
     Args:
         views: The corners.
         side: 0 left, 1 right.
+        lens: Whether the lens is estimated; else there is none.
     """
     points, seen = _for_opencv(views, side)
-    _, k, lens, _, _ = cv2.calibrateCamera(points, seen, views.image_size, None, None)
+    _, k, bent, _, _ = cv2.calibrateCamera(
+        points, seen, views.image_size, None, None, flags=0 if lens else _NO_LENS
+    )
     return PinholeCamera(
         ("left", "right")[side],
         Intrinsics.from_matrix(k),
         views.image_size,
-        Lens("radtan", np.asarray(lens, dtype=float).ravel()[:5]),
+        Lens("radtan", np.asarray(bent, dtype=float).ravel()[:5]),
     )
 
 
-def zhang_pair(views: BoardViews) -> StereoRig:
-    """Both cameras by Zhang's method, placed by OpenCV's stereo calibration."""
-    pair = zhang(views, 0), zhang(views, 1)
+def zhang_pair(views: BoardViews, *, lens: bool = True) -> StereoRig:
+    """Both cameras by :func:`zhang`, placed by OpenCV's stereo calibration."""
+    pair = zhang(views, 0, lens=lens), zhang(views, 1, lens=lens)
     points, left = _for_opencv(views, 0)
     (k_left, d_left), (k_right, d_right) = (
         (camera.intrinsics.matrix, camera.lens.coefficients.copy()) for camera in pair

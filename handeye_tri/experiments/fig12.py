@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.experiments.outcome import Options, Outcome, finish, new_figure
-from handeye_tri.pipeline import STAGES, VERBS, Run, execute, start
+from handeye_tri.pipeline import STAGES, VERBS, NullProgress, Run, execute, start
 
 Floats = NDArray[np.float64]
 
@@ -18,23 +18,10 @@ CELL, SEED = "hp3_stereo", 1
 _PAPER_MM = 2.8
 
 
-class _Silent:
-    """Progress of the stages, which the experiment does not show."""
-
-    def begin(self, number: int, total: int, stage: str) -> None:
-        """Nothing."""
-
-    def advance(self, done: int, total: int) -> None:
-        """Nothing."""
-
-    def end(self, line: str, seconds: float | None) -> None:
-        """Nothing."""
-
-
 def run(options: Options) -> Outcome:
     """Run the rendered cell up to its evaluation; a session in the folder."""
     folder = start(CELL, options.folder / "fig12_session", SEED, None)
-    session = Run(folder, _Silent())
+    session = Run(folder, NullProgress())
     verbs = tuple(verb for verb in VERBS if verb != "report")
     with folder.locked():
         execute(session, STAGES, verbs, again=False)

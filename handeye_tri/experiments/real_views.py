@@ -7,20 +7,19 @@ them, and three where a half-turn takes them, with nobody turning anything.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.calibrate_cameras import calibrate_camera
 from handeye_tri.camera import PinholeCamera, StereoRig
-from handeye_tri.errors import InputError
 from handeye_tri.experiments.chessboard import (
     Board,
     BoardViews,
     board_half_turns,
     read_board_views,
 )
-from handeye_tri.experiments.outcome import Options
 from handeye_tri.records import CameraCalibration
 from handeye_tri.se3 import SE3, se3_inverse
 
@@ -60,24 +59,15 @@ class RealStereo:
         return StereoRig(*self.cameras, SE3.mean([SE3(m) for m in relative]))
 
 
-def calibrate_views(options: Options) -> RealStereo:
+def calibrate_views(images: Path) -> RealStereo:
     """Calibrate both cameras of a folder of chessboard views.
 
     Raises:
-        InputError: there is no folder, or too few views in it.
+        InputError: there are too few views in the folder.
     """
-    views = _read(options)
+    views = read_board_views(images, BOARD)
     left, right = (calibrate_side(views, side) for side in range(2))
     return RealStereo(views, (left, right), len(left.residuals[0]) // 2)
-
-
-def _read(options: Options) -> BoardViews:
-    if options.images is None:
-        raise InputError(
-            "this experiment needs real views: give --images a folder of chessboard "
-            "views left01.jpg, right01.jpg, left02.jpg and so on (9 x 6 inner corners)"
-        )
-    return read_board_views(options.images, BOARD)
 
 
 def calibrate_side(

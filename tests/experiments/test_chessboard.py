@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
-from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
+from handeye_tri.camera import Intrinsics, Lens, PinholeCamera, StereoRig
 from handeye_tri.errors import InputError
 from handeye_tri.experiments import fig09, table1
 from handeye_tri.experiments.chessboard import (
@@ -22,6 +23,8 @@ from handeye_tri.experiments.real_views import (
     calibrate_side,
     calibrate_views,
 )
+from handeye_tri.experiments.rendered import RenderedStereo
+from handeye_tri.records import Covariance
 from handeye_tri.se3 import SE3, so3_exp
 from handeye_tri.storage import write_image
 
@@ -181,15 +184,60 @@ def test_a_folder_without_views_is_named(tmp_path, make):
         read_board_views(folder, BOARD)
 
 
-def test_experiments_on_views_ask_for_them(tmp_path):
-    for experiment in (table1, fig09):
-        with pytest.raises(InputError, match="give --images a folder"):
-            experiment.run(Options(tmp_path))
+@pytest.fixture
+def no_rendering(monkeypatch):
+    """Table I and Fig. 9 of a pair that was not rendered but projected."""
+    views = simulated(noise=0.002)
+    found = [calibrate_side(views, side) for side in range(2)]
+    cameras = tuple(one.camera for one in found)
+    both = replace(
+        found[0],
+        cameras=cameras,
+        reference_from_camera=(SE3.identity(), LEFT_FROM_RIGHT),
+        residuals=np.concatenate([one.residuals for one in found]),
+        covariance=Covariance(
+            tuple(label for one in found for label in one.covariance.labels),
+            # Corners take part in many half-turns, which are not independent.
+            100 * block_diag(*(one.covariance.matrix for one in found)),
+        ),
+    )
+    rendered = RenderedStereo(both, 144, StereoRig(*PAIR, LEFT_FROM_RIGHT))
+    for module in (table1, fig09):
+        monkeypatch.setattr(module, "calibrate_rendered", lambda *_: rendered)
+        monkeypatch.setattr(module, "rendered_board_views", lambda *_: views)
+    monkeypatch.setattr(table1, "zhang", lambda views, side, **_: zhang(views, side))
+    monkeypatch.setattr(fig09, "zhang_pair", lambda views, **_: zhang_pair(views))
+    return rendered
+
+
+def test_without_real_views_the_clock_is_judged(tmp_path, no_rendering):
+    outcome = table1.run(Options(tmp_path))
+    assert outcome.verdict == "PASS"
+    assert "no real views" in outcome.sentence
+    lines = outcome.files[0].read_text().splitlines()
+    assert len(lines) == 1 + 2 * 5
+    assert lines[1].startswith("clock,left,fu,533.0,")
+    outcome = fig09.run(Options(tmp_path))
+    assert outcome.verdict == "PASS"
+    assert "rendered clock: 744 adjacent corners" in outcome.sentence
+
+
+@pytest.mark.parametrize(("factor", "passed"), [(1.002, False), (1.0, True)])
+def test_the_clock_fails_where_its_camera_is_off(
+    tmp_path, no_rendering, monkeypatch, factor, passed
+):
+    """0.2 % is within the tolerance, and far outside the stated sigmas."""
+    true = no_rendering.true
+    k = true.left.intrinsics
+    left = replace(true.left, intrinsics=replace(k, fx=factor * k.fx))
+    wrong = replace(no_rendering, true=replace(true, left=left))
+    monkeypatch.setattr(table1, "calibrate_rendered", lambda *_: wrong)
+    assert (table1.run(Options(tmp_path)).verdict == "PASS") == passed
 
 
 @pytest.fixture(scope="module")
 def real():
-    return calibrate_views(Options(Path("unused"), images=REAL))
+    return calibrate_views(REAL)
 
 
 @needs_real
@@ -205,9 +253,9 @@ def test_real_views_give_zhangs_cameras(real):
 
 
 @needs_real
-def test_real_corners_are_where_they_belong(real, tmp_path, monkeypatch):
-    monkeypatch.setattr(fig09, "calibrate_views", lambda options: real)
-    outcome = fig09.run(Options(tmp_path))
+def test_real_corners_are_where_they_belong(real, tmp_path, monkeypatch, no_rendering):
+    monkeypatch.setattr(fig09, "calibrate_views", lambda images: real)
+    outcome = fig09.run(Options(tmp_path, images=REAL))
     assert outcome.verdict == "PASS"
     assert all(path.stat().st_size > 0 for path in outcome.files)
     points = fig09.reconstruct(real.rig, real.views)
@@ -217,7 +265,7 @@ def test_real_corners_are_where_they_belong(real, tmp_path, monkeypatch):
 
 
 @needs_real
-def test_table_1_of_a_few_real_views(tmp_path):
+def test_table_1_of_a_few_real_views(tmp_path, no_rendering):
     folder = tmp_path / "views"
     folder.mkdir()
     for number in ("01", "04", "05", "06", "08"):
@@ -226,6 +274,7 @@ def test_table_1_of_a_few_real_views(tmp_path):
     outcome = table1.run(Options(tmp_path / "out", images=folder))
     assert "720 half-turns in 5 pairs" in outcome.sentence
     lines = outcome.files[0].read_text().splitlines()
-    assert len(lines) == 1 + 2 * 10
-    assert lines[0].startswith("camera,quantity,three_points,sigma,zhang")
+    assert len(lines) == 1 + 2 * 5 + 2 * 10
+    assert lines[0].startswith("views,camera,quantity,truth,three_points,sigma,zhang")
+    assert lines[-1].startswith("boards,right,k3,,")
     assert len((tmp_path / "out" / "table1.jsonl").read_text().splitlines()) == 1 + 10
