@@ -76,6 +76,10 @@ def gates_worst_first(gates: Sequence[Mapping[str, Any]]) -> list[Mapping[str, A
     return sorted(gates, key=lambda gate: (_ORDER[gate["verdict"]], -gate["use"]))
 
 
+# What a solver that is not of AX = XB solves.
+_FORMS = {"shah": "AX = ZB", "li": "AX = ZB", "separate": "step by step"}
+
+
 def alternatives(calibration: HandEyeCalibration) -> list[Row]:
     """Other solvers' ``base_from_<first camera>`` beside the result's."""
     first = calibration.cameras[0].name
@@ -90,7 +94,7 @@ def alternatives(calibration: HandEyeCalibration) -> list[Row]:
         rows.append(
             {
                 "name": name,
-                "form": "AX = ZB" if name in ("shah", "li") else "AX = XB",
+                "form": _FORMS.get(name, "AX = XB"),
                 "shift": number(shift, sigma_mm),
                 "shift_sigmas": f"{shift / sigma_mm:.1f}",
                 "turn": number(turn, sigma_deg),
