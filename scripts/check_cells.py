@@ -163,7 +163,6 @@ def report(cell: str, rows: list[dict[str, float]]) -> list[str]:
         *missed("mean track error, mm", mean["joint"], 0.0, track_limit),
         *missed("calibration's part, mm", mean["part"], 0.0, part_limit),
         *missed("track over prediction", of, *RATIO),
-        *missed("chi2/dof of the cameras", mean["chi2 cameras"], *CHI2),
         *missed("chi2/dof", mean["chi2"], *CHI2),
         *missed("runs that PASS", mean["passed"], 1.0, 1.0),
     ]

@@ -2,8 +2,7 @@
 
 Example: python scripts/check_detection.py --views 100
 
-Truth is the centre of a ball's outline, (X, Y) Z / (Z^2 - r^2) of the normalised
-plane, through lens and K. NEES is the mean normalised squared error per axis: 1 where
+Truth is the centre of a ball's outline as perspective and lens make it. NEES is the mean normalised squared error per axis: 1 where
 the predicted covariance is right. Times are of one thread, in five interleaved
 rounds with OpenCV's SimpleBlobDetector at its defaults.
 """
@@ -19,6 +18,7 @@ import numpy as np
 
 from handeye_tri import storage
 from handeye_tri.arm import Arm
+from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
 from handeye_tri.detect import MarkerSpec, detect_markers
 from handeye_tri.plan import plan_motions
 from handeye_tri.simulate import compile_mechanism, render_views
@@ -70,13 +70,13 @@ def check(name: str, views: int, plans: int, seed: int) -> str:
         camera = cell.cameras[i]
         points = world_from_base.apply(arm.marker_positions(joints[j]))
         points = camera.world_from_camera.inverse().apply(points)
-        depth = points[:, 2:]
-        outline = points[:, :2] * depth / (depth**2 - radii[:, None] ** 2)
+        middle = camera.camera.project(points)
+        middle += sphere_shift(camera.camera, points, radii)
         found = detect_markers(image, spec)
         if len(timed) < TIMED_VIEWS:
             timed.append(image)
         for error, covariance in zip(
-            found.pixels - camera.camera.pixels(outline), found.covariance, strict=True
+            found.pixels - middle, found.covariance, strict=True
         ):
             if np.isnan(error).any():
                 missed += 1

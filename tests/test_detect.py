@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from handeye_tri import storage
 from handeye_tri.arm import Arm
+from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
 from handeye_tri.detect import (
     Detection,
     MarkerSpec,
@@ -444,10 +445,9 @@ def test_rendered_views_of_planned_stations(name: str) -> None:
     for i, j, image in render_views(cell, model, joints, 3, wanted):
         world = arm.base_from_world.inverse().apply(arm.marker_positions(joints[j]))
         points = cell.cameras[i].world_from_camera.inverse().apply(world)
-        depth = points[:, 2:]
-        outline = points[:, :2] * depth / (depth**2 - radii[:, None] ** 2)
+        camera = cell.cameras[i].camera
         found.append(detect_markers(image, spec))
-        truth.append(cell.cameras[i].camera.pixels(outline))
+        truth.append(camera.project(points) + sphere_shift(camera, points, radii))
     error, squares = errors_of(found, truth)
     assert np.sqrt((error**2).mean(axis=0)).max() < 0.03
     assert np.abs(error).max() < 0.15

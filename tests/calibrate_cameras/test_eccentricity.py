@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
@@ -70,6 +71,30 @@ def test_least_squares_ellipse_lies_at_the_centroid():
     middle = camera.project(CENTRES[0]) + sphere_shift(camera, CENTRES[0], 0.008)
     # Second order in the bending, which moves the outline by 0.03 of 15 px.
     np.testing.assert_allclose(fitted + outline.mean(0), middle, atol=2e-3)
+
+
+@pytest.mark.parametrize("centre", CENTRES)
+def test_the_ellipse_nearest_to_a_bent_outline_lies_there(centre):
+    """Detection fits distances to the outline: the same centre to 1e-5 px."""
+    lens = Lens("radtan", np.array([-0.19, 0.14, 6e-4, -4e-4, 0.0]))
+    camera = PinholeCamera("left", INTRINSICS, (1024, 768), lens)
+    outline = traced_outline(camera, centre, 0.008, 400)
+
+    def distances(ellipse):
+        x, y = (outline - ellipse[:2]).T
+        size, e, f = ellipse[2:]
+        across, down = (1 + e) * x + f * y, f * x + (1 - e) * y
+        q = np.sqrt(x * across + y * down)
+        return (q - size) * q / np.hypot(across, down)
+
+    start = [*outline.mean(axis=0), 15.0, 0.0, 0.0]
+    fitted = least_squares(distances, start, xtol=1e-14, ftol=1e-14).x[:2]
+    middle = camera.project(centre) + sphere_shift(camera, centre, 0.008)
+    np.testing.assert_allclose(fitted, middle, atol=1e-5)
+    # What the lens adds to a pinhole's outline is a thousand times that.
+    axial = centre - np.array([0.0, 0.0, 0.008**2 / centre[2]])
+    added = np.linalg.norm(middle - camera.project(axial))
+    assert (added > 5e-3) == (np.hypot(*centre[:2]) > 0.1)
 
 
 def test_point_and_unseen_and_engulfed():
