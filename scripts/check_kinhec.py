@@ -215,26 +215,36 @@ def evaluate(
 
 
 def table(folder: Path) -> bool:
-    """Print medians per track; whether every bar is met."""
-    errors: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(
-        lambda: defaultdict(list)
+    """Print medians per track; whether every bar is met.
+
+    A solver is compared on a track where it was run on all sequences that ours was.
+    """
+    errors: dict[str, dict[str, dict[str, tuple[float, float]]]] = defaultdict(
+        lambda: defaultdict(dict)
     )
     failures: dict[str, int] = defaultdict(int)
     for line in (folder / "check.jsonl").read_text().splitlines():
         row = json.loads(line)
         failed = bool(row["error"])
         failures[row["solver"]] += failed
-        errors[row["track"]][row["solver"]].append(
+        errors[row["track"]][row["solver"]][row["sequence"]] = (
             (np.inf, np.inf)
             if failed
             else (row["X_rot_err_deg"], row["X_trans_err_mm"])
         )
-    print(f"{'track':<12}{'n':>4}  {'ours':>19}   best of the others (rot; trans)")
+    print(f"{'track':<12}{'n':>4}  {'ours':>21}   best of the others (rotation; place)")
     good, shares = True, []
     for track, solvers in sorted(errors.items()):
-        if len(solvers) < 2 or "ours" not in solvers:
+        sequences = sorted(solvers.get("ours", {}))
+        medians = {
+            name: np.median([rows[one] for one in sequences], axis=0)
+            for name, rows in solvers.items()
+            if sequences and set(sequences) <= set(rows)
+        }
+        if len(medians) < 2:
+            print(f"{track:<12}{len(sequences):>4}  nothing to compare with")
+            good = False
             continue
-        medians = {name: np.median(rows, axis=0) for name, rows in solvers.items()}
         own = medians.pop("ours")
         best = [min(medians, key=lambda name: medians[name][k]) for k in (0, 1)]
         ratios = [own[k] / medians[best[k]][k] for k in (0, 1)]
@@ -243,9 +253,10 @@ def table(folder: Path) -> bool:
         shares.append(ratios)
         rotation, translation = (medians[best[k]][k] for k in (0, 1))
         print(
-            f"{track:<12}{len(solvers['ours']):>4}  {own[0]:8.4f} deg {own[1]:7.3f} mm"
-            f"   {rotation:8.4f} deg ({best[0]}), {translation:7.3f} mm ({best[1]}); "
-            f"ratios {ratios[0]:.3f}, {ratios[1]:.3f}  {'ok' if met else 'MISSED'}"
+            f"{track:<12}{len(sequences):>4}  {own[0]:8.4f} deg {own[1]:7.3f} mm   "
+            f"{len(medians)} others: {rotation:.4f} deg ({best[0]}), "
+            f"{translation:.3f} mm ({best[1]}); ratios {ratios[0]:.3f}, "
+            f"{ratios[1]:.3f}  {'ok' if met else 'MISSED'}"
         )
     overall = np.exp(np.mean(np.log(shares), axis=0))
     print(
@@ -267,7 +278,8 @@ def main() -> None:
         "--slow", action="store_true", help="also shah+lm on all frames (10 s each)"
     )
     arguments = parser.parse_args()
-    if not (arguments.data / "sequences.parquet").exists():
+    if not (arguments.data / "sequences.csv").exists():
+        # It is the last file made: what was interrupted goes on.
         make(arguments.data, arguments.seed)
     evaluate(
         arguments.data,
