@@ -2,9 +2,10 @@
 
 Example: python scripts/check_detection.py --views 100
 
-Truth is the centre of a ball's outline as perspective and lens make it. NEES is the mean normalised squared error per axis: 1 where
-the predicted covariance is right. Times are of one thread, in five interleaved
-rounds with OpenCV's SimpleBlobDetector at its defaults.
+Truth is the centre of a ball's outline as perspective and lens make it. NEES is the
+mean normalised squared error per axis: 1 where the predicted covariance is right.
+Times are of one thread, in five interleaved rounds with OpenCV's SimpleBlobDetector at
+its defaults.
 """
 
 from __future__ import annotations
