@@ -182,3 +182,40 @@ def test_plan_names_what_a_list_of_stations_lacks(capsys, tmp_path):
     code, _, err = call(capsys, *arguments)
     assert code == 2
     assert "--certify needs --cell" in err
+
+
+def test_a_programme_is_written_from_a_plan(capsys, tmp_path):
+    session = tmp_path / "out"
+    call(capsys, "plan", session, "--cell", "hp3_stereo", "--half-turns", 3)
+    listed, script = tmp_path / "stations.csv", tmp_path / "calibrate.script"
+    code, out, _ = call(capsys, "programme", session, "csv", "-o", listed)
+    assert code == 0
+    assert f"wrote {listed}" in out
+    code, _, _ = call(
+        capsys, "programme", session, "urscript", "-o", script, "--dwell", 2
+    )
+    assert code == 0
+    assert script.read_text().count("sleep(2)") == 12
+    # What was written is judged as what was planned: all its stations calibrate.
+    again = tmp_path / "again"
+    code, out, _ = call(
+        capsys, "plan", again, "--cell", "hp3_stereo", "--certify", listed
+    )
+    assert code == 0
+    assert "3 half-turns, 12 stations + 0 held out" in out
+
+
+def test_no_programme_is_written_of_a_plan_that_fails(capsys, tmp_path):
+    listed, session = tmp_path / "stations.csv", tmp_path / "out"
+    listed.write_text(STATIONS)
+    call(capsys, "plan", session, "--cell", "hp3_stereo", "--certify", listed)
+    target = tmp_path / "p.json"
+    code, _, err = call(capsys, "programme", session, "json", "-o", target)
+    assert code == 4
+    assert "the plan's verdict is CANNOT TELL" in err
+    assert not target.exists()
+    code, _, _ = call(
+        capsys, "programme", session, "json", "-o", target, "--even-if-failed"
+    )
+    assert code == 0
+    assert "CANNOT TELL" in target.read_text()

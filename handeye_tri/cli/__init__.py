@@ -14,6 +14,7 @@ from handeye_tri.cli import (
     exchange,
     experiment,
     importing,
+    programme,
     session,
     solve,
 )
@@ -27,6 +28,7 @@ __all__ = [
     "experiment",
     "importing",
     "main",
+    "programme",
     "session",
     "solve",
 ]

@@ -1,0 +1,58 @@
+"""The verb that writes a plan as a programme for the robot."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from handeye_tri.cli.group import EXIT_CODES, SESSION, commands, example
+from handeye_tri.cli.progress import cap_threads
+
+_LAYOUTS = ("csv", "json", "joint_trajectory", "urscript")
+
+
+@commands.command(
+    epilog=example("handeye-tri programme out urscript -o calibrate.script")
+)
+@SESSION
+@click.argument("layout", metavar="FORMAT", type=click.Choice(_LAYOUTS))
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="The file.",
+)
+@click.option(
+    "--dwell",
+    default=1.0,
+    show_default=True,
+    help="Seconds that the robot stands at a station.",
+)
+@click.option("--even-if-failed", is_flag=True, help="Whatever the plan's verdict.")
+def programme(
+    session: Path, layout: str, output: Path, dwell: float, even_if_failed: bool
+) -> None:
+    """Write a session's plan as a programme that a robot can run.
+
+    FORMAT: csv (joints by station), json, joint_trajectory (ROS 2), urscript.
+    """
+    from handeye_tri.pipeline import NullProgress, Run
+    from handeye_tri.pipeline.programme import write_programme
+    from handeye_tri.storage import SessionFolder
+
+    cap_threads()
+    run = Run(SessionFolder.open(session), NullProgress())
+    outcome = run.plan().outcome
+    if outcome != "PASS" and not even_if_failed:
+        click.echo(
+            f"error: {session}: the plan's verdict is {outcome}, so no programme is "
+            f"written; see handeye-tri plan {session}, or add --even-if-failed",
+            err=True,
+        )
+        sys.exit(EXIT_CODES[outcome])
+    write_programme(run, layout, output, dwell)
+    click.echo(f"VERDICT  {outcome} (expected, before the robot moves)")
+    click.echo(f"wrote {output}")

@@ -1,0 +1,78 @@
+"""A session's plan as files that a robot can run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from handeye_tri import storage
+from handeye_tri.errors import InputError
+from handeye_tri.exchange.robot_programme import (
+    Programme,
+    joint_trajectory_yaml,
+    programme_json,
+    urscript,
+)
+from handeye_tri.pipeline.run import Run
+
+# What each is for, in a few words.
+LAYOUTS = {
+    "csv": "joint values by station, units in the column names",
+    "json": "the same with the points passed on the way",
+    "joint_trajectory": "ROS 2 JointTrajectory message in YAML",
+    "urscript": "URScript: moves, and a stop at each station",
+}
+
+
+def write_programme(run: Run, layout: str, path: Path, dwell: float) -> None:
+    """Write the plan of a session.
+
+    Args:
+        run: A session that is planned.
+        layout: One of LAYOUTS.
+        path: The file.
+        dwell: How long the robot stands at a station, seconds.
+
+    Raises:
+        InputError: the layout is unknown or cannot hold the programme.
+        StorageError: there is no plan, or the file cannot be written.
+    """
+    plan, arm = run.plan(), run.arm
+    cell = run.designed_cell
+    outcome = f"verdict {plan.outcome}: " + ("; ".join(plan.findings) or "no finding")
+    programme = Programme(
+        head=(
+            f"handeye-tri: {len(plan.half_turns)} half-turns of cell {cell.name}, "
+            f"seed {plan.seed}",
+            outcome,
+            "Planned in the model of the cell: try it slowly, a hand on the stop.",
+        ),
+        joint_names=arm.joint_names,
+        slides=arm.slides,
+        home=arm.home,
+        stops=np.array([station.joints for station in plan.stations]),
+        kinds=tuple(station.kind for station in plan.stations),
+        via=plan.via,
+        speed=arm.speed,
+        acceleration_time=cell.arm.acceleration_time_s,
+        dwell=dwell,
+    )
+    if layout == "csv":
+        if any(len(points) for points in plan.via):
+            raise InputError(
+                "csv holds stations only, and this plan passes points between them; "
+                "choose json, joint_trajectory or urscript"
+            )
+        storage.write_joint_list(
+            path, programme.joint_names, programme.slides, programme.stops
+        )
+        return
+    writers = {
+        "json": programme_json,
+        "joint_trajectory": joint_trajectory_yaml,
+        "urscript": urscript,
+    }
+    if layout not in writers:
+        raise InputError(f"there is no {layout!r}; there are {', '.join(LAYOUTS)}")
+    storage.write_bytes(path, writers[layout](programme).encode())
