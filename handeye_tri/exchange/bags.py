@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from handeye_tri.errors import HandEyeError, InputError, StorageError
 from handeye_tri.exchange.capture import MAX_POSES, ImageStream, PoseStream
 from handeye_tri.exchange.mcap_bag import SESSION_TOPIC, import_ros
+from handeye_tri.exchange.mcap_check import check_mcap
 from handeye_tri.exchange.tf_tree import Frames
 from handeye_tri.records import Floats, RobotDirection
 from handeye_tri.se3 import rotation_from_quaternion_wxyz, se3_inverse
@@ -74,6 +75,10 @@ class BagFile:
         import_ros()
         self.path = path
         self._ros1 = path.suffix == ".bag"
+        files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        for file in files:
+            if file.suffix == ".mcap":
+                check_mcap(file)
         with self._open() as reader:
             self.topics = {
                 c.topic: (str(c.msgtype), int(c.msgcount)) for c in reader.connections

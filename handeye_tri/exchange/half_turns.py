@@ -104,7 +104,9 @@ def find_half_turns(base_from_flange: Floats, tolerance: TurnTolerance) -> Found
         [_difference(one, other, tolerance) == "" for other in candidates]
         for one in candidates
     ]
-    leader = candidates[int(np.argmax(np.sum(agree, axis=1)))]
+    # What does not even agree with itself moved along its axis.
+    support = np.sum(agree, axis=1) * np.diagonal(agree)
+    leader = candidates[int(np.argmax(support))]
     turns: list[Turn] = []
     others = []
     for turn in candidates:
@@ -117,6 +119,8 @@ def find_half_turns(base_from_flange: Floats, tolerance: TurnTolerance) -> Found
             others.append(f"{name}: station {turn.before} already belongs to {last}")
         else:
             turns.append(turn)
+    if not turns:
+        return FoundTurns((), tuple(others), empty, empty)
     signs = [1.0 if turn.axis @ leader.axis > 0 else -1.0 for turn in turns]
     axis = np.mean([s * t.axis for s, t in zip(signs, turns, strict=True)], axis=0)
     foot = np.mean([turn.foot for turn in turns], axis=0)

@@ -44,8 +44,10 @@ def find_images(source: Path, patterns: Mapping[str, str]) -> dict[str, list[Pat
                 for path in source.glob(pattern)
                 if path.suffix.lower() in _SUFFIXES and path.is_file()
             ]
-        except (ValueError, NotImplementedError, IndexError) as error:
-            raise InputError(f"--image {camera}={pattern}: {error}") from None
+        except (ValueError, NotImplementedError, IndexError, OSError) as error:
+            raise InputError(
+                f"--image {camera}={pattern:.80}: this is no pattern ({error!s:.80})"
+            ) from None
         if not paths:
             raise InputError(
                 f"{source}: no image matches {pattern!r} for camera {camera}; say "
@@ -149,7 +151,9 @@ def timed_images(paths: Sequence[Path], unit: TimeUnit) -> ImageStream:
     for path in paths:
         pattern = r"\d{1,20}" if unit == "ns" else r"\d{1,12}(\.\d{1,12})?"
         if not re.fullmatch(pattern, path.stem):
-            raise InputError(f"{path}: the name is no time in {unit}")
+            raise InputError(
+                f"{path.parent}: the name {path.name!r:.80} is no time in {unit}"
+            )
         times.append(int(path.stem) / 1e9 if unit == "ns" else float(path.stem))
     return _ordered(list(paths), times, "their names")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -31,20 +32,24 @@ def read_structured(path: Path) -> Any:
             data = json.loads(text)
         else:
             data = YAML(typ="safe", pure=True).load(text)
+        count = _unfolded(data, {})
     except (YAMLError, RecursionError, LookupError, *_WRONG) as error:
         first = (str(error).splitlines() or ["it is nested too deeply"])[0]
         raise StorageError(f"{path}: this is not readable {kind} ({first})") from None
-    waiting, seen = [data], 0
-    while waiting:
-        node = waiting.pop()
-        seen += 1
-        if seen > _MAX_VALUES:
-            raise InputError(f"{path}: this unfolds to more than {_MAX_VALUES} values")
-        if isinstance(node, Mapping):
-            waiting.extend(node.values())
-        elif isinstance(node, list):
-            waiting.extend(node)
+    if count > _MAX_VALUES:
+        raise InputError(f"{path}: this unfolds to more than {_MAX_VALUES} values")
     return data
+
+
+def _unfolded(node: Any, known: dict[int, float]) -> float:
+    """Number of values when every alias is written out; inf for what holds itself."""
+    if not isinstance(node, Mapping | list):
+        return 1
+    if id(node) not in known:
+        known[id(node)] = math.inf
+        parts = list(node.values()) if isinstance(node, Mapping) else node
+        known[id(node)] = 1 + sum(_unfolded(part, known) for part in parts)
+    return known[id(node)]
 
 
 # What the parsers raise, beyond their own, for text, dates and keys that cannot be.

@@ -285,7 +285,7 @@ def test_joints_are_taken_by_name_whatever_else_reports(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("x.mcap", b"", "no readable recording"),
+        ("x.mcap", b"", "damaged or cut off"),
         ("x.bag", b"#ROSBAG V2.0\n rest", "no readable recording"),
         ("x.db3", b"abc", "no readable recording"),
         ("x.zip", b"abc", "no readable recording"),
