@@ -219,3 +219,11 @@ def test_no_programme_is_written_of_a_plan_that_fails(capsys, tmp_path):
     )
     assert code == 0
     assert "CANNOT TELL" in target.read_text()
+
+
+def test_what_to_add_needs_something_detected(capsys, tmp_path):
+    session = tmp_path / "out"
+    call(capsys, "plan", session, "--cell", "hp3_stereo", "--half-turns", 2)
+    code, _, err = call(capsys, "plan", session, "--next", 2)
+    assert code == 2
+    assert f"handeye-tri detect {session}" in err

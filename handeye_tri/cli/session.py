@@ -92,6 +92,12 @@ def run(
     type=click.Path(path_type=Path),
     help="Judge the stations of this CSV file (columns such as s_deg) instead.",
 )
+@click.option(
+    "--next",
+    "more",
+    type=click.IntRange(min=1),
+    help="Plan so many half-turns more, for what was detected so far: next.csv.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print plan.json only.")
 @AGAIN
 def plan(
@@ -100,6 +106,7 @@ def plan(
     seed: int,
     half_turns: int | None,
     certify: Path | None,
+    more: int | None,
     as_json: bool,
     again: bool,
 ) -> None:
@@ -115,6 +122,8 @@ def plan(
 
     if certify is not None and cell is None:
         raise click.UsageError("--certify needs --cell: which arm, rig and cameras?")
+    if more is not None:
+        _plan_more(session, more)
     folder = (
         storage.SessionFolder.open(session)
         if cell is None
@@ -127,6 +136,27 @@ def plan(
         click.echo(json.dumps(data, indent=1, ensure_ascii=False))
     else:
         click.echo(plan_text(made, finished.cell.name))
+    sys.exit(EXIT_CODES[made.outcome])
+
+
+def _plan_more(session: Path, more: int) -> None:
+    """Print what half-turns to add, and leave with the verdict's exit code."""
+    from handeye_tri.pipeline import Run
+    from handeye_tri.pipeline.programme import plan_more
+    from handeye_tri.storage import SessionFolder
+    from handeye_tri.summary import plan_text
+
+    cap_threads()
+    progress = StderrProgress()
+    run = Run(SessionFolder.open(session), progress)
+    try:
+        with run.folder.locked():
+            progress.begin(1, 1, "plan")
+            made = plan_more(run, more)
+    finally:
+        progress.close()
+    click.echo(plan_text(made, run.cell.name))
+    click.echo(f"\nWROTE  {run.folder.file('next.csv')}  {len(made.stations)} stations")
     sys.exit(EXIT_CODES[made.outcome])
 
 

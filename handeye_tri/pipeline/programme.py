@@ -15,6 +15,7 @@ from handeye_tri.exchange.robot_programme import (
     urscript,
 )
 from handeye_tri.pipeline.run import Run
+from handeye_tri.records import Plan
 
 # What each is for, in a few words.
 LAYOUTS = {
@@ -23,6 +24,54 @@ LAYOUTS = {
     "joint_trajectory": "ROS 2 JointTrajectory message in YAML",
     "urscript": "URScript: moves, and a stop at each station",
 }
+
+
+def plan_more(run: Run, half_turns: int) -> Plan:
+    """Half-turns that add most to what a session has observed; writes ``next.csv``.
+
+    Args:
+        run: A session whose views were looked at, all or some of them.
+        half_turns: How many.
+
+    Raises:
+        StorageError: nothing was detected yet.
+        NoPlanError: no plan was found.
+    """
+    from handeye_tri.plan import Visited, plan_next
+
+    run.folder.require("detect")
+    session = run.observed()
+    seen = np.asarray(np.isfinite(session.pixels).all(axis=(2, 3)).any(axis=0))
+    used = [
+        k for k, s in enumerate(session.stations) if s.kind == "calibration" and seen[k]
+    ]
+    place = {station: number for number, station in enumerate(used)}
+    turns = [
+        (place[turn.before], place[turn.after])
+        for turn in session.half_turns
+        if turn.before in place and turn.after in place
+    ]
+    last = max(np.flatnonzero(seen), default=None)
+    visited = Visited(
+        session.base_from_flange[used].reshape(-1, 4, 4),
+        np.array(turns, dtype=np.intp).reshape(-1, 2),
+        run.arm.home if last is None else session.stations[last].joints,
+    )
+    plan = plan_next(
+        run.designed_cell,
+        run.arm,
+        visited,
+        run.seed,
+        half_turns,
+        run.progress.advance,
+    )
+    storage.write_joint_list(
+        run.folder.file("next.csv"),
+        run.arm.joint_names,
+        run.arm.slides,
+        np.array([station.joints for station in plan.stations]),
+    )
+    return plan
 
 
 def write_programme(run: Run, layout: str, path: Path, dwell: float) -> None:

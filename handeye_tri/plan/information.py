@@ -131,8 +131,9 @@ class StationInformation:
         """Information of each station, shape (n, p, p), of poses (n, 4, 4)."""
         by_unknowns, by_error, _ = self._derivatives(base_from_flange)
         n, p = len(base_from_flange), len(self.labels)
-        a = by_unknowns.reshape(n, -1, p)
-        b = by_error.reshape(n, -1, 6)
+        rows = by_unknowns.shape[1] * 6
+        a = by_unknowns.reshape(n, rows, p)
+        b = by_error.reshape(n, rows, 6)
         noise = b @ self._pose_covariance @ b.swapaxes(-1, -2)
         noise += self.sigma_px**2 * np.eye(a.shape[1])
         return np.asarray(a.swapaxes(-1, -2) @ np.linalg.solve(noise, a))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,6 +99,54 @@ def plan_motions(
     return _Planner(cell, arm, seed, wanted, progress).plan()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Visited:
+    """Stations that the cameras have seen already.
+
+    Attributes:
+        base_from_flange: Shape (n, 4, 4), metres.
+        turns: Which of them make half-turns, shape (k, 2).
+        joints: Where the arm stands now, shape (q,), rad or m.
+    """
+
+    base_from_flange: Floats
+    turns: NDArray[np.intp]
+    joints: Floats
+
+
+def plan_next(
+    cell: Cell,
+    arm: Arm,
+    visited: Visited,
+    seed: int,
+    half_turns: int,
+    progress: Progress | None = None,
+) -> Plan:
+    """Plan the half-turns that add most to what was seen already.
+
+    The certificate is that of all stations together; the cycle time that of the new
+    ones, from where the arm stands.
+
+    Args:
+        cell: The cell.
+        arm: The robot in it.
+        visited: What was seen.
+        seed: Same seed, same plan.
+        half_turns: How many to add, at least 1.
+        progress: Called with (done, total) as the search goes on.
+
+    Returns:
+        The new stations alone.
+
+    Raises:
+        InputError: no half-turn is asked for.
+        NoPlanError: no plan was found; says which check rejected how many.
+    """
+    if half_turns < 1:
+        raise InputError(f"half_turns must be at least 1, got {half_turns}")
+    return _Planner(cell, arm, seed, half_turns, progress, visited).plan()
+
+
 class _Planner:
     def __init__(
         self,
@@ -106,11 +155,17 @@ class _Planner:
         seed: int,
         wanted: int,
         progress: Progress | None,
+        visited: Visited | None = None,
     ) -> None:
         self.cell = cell
         self.arm = arm
         self.seed = seed
         self.wanted = wanted
+        # What more is planned for needs no stations of its own to test it.
+        self.held_out = 0 if visited else cell.plan.evaluation_stations
+        self.visited = visited or Visited(
+            np.zeros((0, 4, 4)), np.zeros((0, 2), dtype=np.intp), arm.home
+        )
         self.view = View(cell)
         self.model = StationInformation(
             self.view,
@@ -119,7 +174,7 @@ class _Planner:
             EXPECTED_SIGMA_PX,
         )
         self.pool_size = min(_POOL * wanted, _LARGEST_POOL)
-        self.total = self.pool_size + wanted + cell.plan.evaluation_stations
+        self.total = self.pool_size + wanted + self.held_out
         self.progress = progress
         self.done = -1
         self.rejected: Counter[str] = Counter()
@@ -166,7 +221,8 @@ class _Planner:
         without_solids = Counter(self.rejected)
         design = Design(
             self.model.of_half_turns(np.array([p.base_from_flange for p in pool])),
-            self.model.prior,
+            self.model.prior
+            + self.model.of_stations(self.visited.base_from_flange).sum(axis=0),
             self.model.workspace_cost,
         )
         selector = Selector(design, pool, search, self.wanted, checked)
@@ -224,15 +280,16 @@ class _Planner:
         normals = np.array([c.normal for c in options])
         spread = plane_angles(normals[:, None], normals[None]) >= least
         times = np.where(spread, self.route.time(end[:, None], begin[None]), np.inf)
-        stops = Stops(stop, self.route.time(self.arm.home, begin), times)
-        route = self.route.drive(stops, self.arm.home, begin, end)
+        start = self.visited.joints
+        stops = Stops(stop, self.route.time(start, begin), times)
+        route = self.route.drive(stops, start, begin, end)
         if route is not None:
             return [options[k] for k in route.order], route.via
         return int(np.argmin(np.bincount(stop, np.isfinite(times).sum(axis=1))))
 
     def _evaluation(self, start: Floats) -> tuple[list[Candidate], list[Floats]]:
         """Stations anywhere in the workspace, in the order of least time."""
-        wanted = self.cell.plan.evaluation_stations
+        wanted = self.held_out
         if wanted == 0:
             return [], []
         search = CandidateSearch(
@@ -274,11 +331,15 @@ class _Planner:
         turns = tuple(
             HalfTurn(2 * k, 2 * k + 1, self.cell.rig.axis) for k in range(len(chosen))
         )
+        seen = len(self.visited.base_from_flange)
+        added = seen + np.arange(2 * len(chosen)).reshape(-1, 2)
         certified = certify(
             self.cell,
             self.model,
-            np.concatenate([c.base_from_flange for c in chosen]),
-            np.arange(2 * len(chosen)).reshape(-1, 2),
+            np.concatenate(
+                [self.visited.base_from_flange, *(c.base_from_flange for c in chosen)]
+            ),
+            np.concatenate([self.visited.turns, added]),
         )
         certificate = dict(certified.numbers)
         certificate["relaxed_bound_mm"] = float(1e3 * np.sqrt(bound))
@@ -287,7 +348,7 @@ class _Planner:
         joints = [s.joints for s in (*calibration, *held_out)]
         route = np.array(
             [
-                self.arm.home,
+                self.visited.joints,
                 *(q for v, s in zip(via, joints, strict=True) for q in (*v, s)),
             ]
         )

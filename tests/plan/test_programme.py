@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import time
+from itertools import pairwise
 
 import mujoco
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 
 from handeye_tri.arm import Arm
 from handeye_tri.errors import InputError, NoPlanError
-from handeye_tri.plan import plan_motions
+from handeye_tri.plan import Visited, plan_motions, plan_next
+from handeye_tri.plan.certificate import certify
+from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import View
 from handeye_tri.simulate import compile_mechanism
 from handeye_tri.simulate.compile import compile_cell
@@ -151,7 +154,6 @@ def test_evaluation_stations_are_elsewhere(name):
 def test_the_chosen_half_turns_tell_more_than_random_ones():
     """Against the first eleven candidates of the same search."""
     from handeye_tri.plan.candidates import CandidateSearch
-    from handeye_tri.plan.information import StationInformation
 
     cell, arm = scene.cell_of("hp3_stereo"), scene.arm_of("hp3_stereo")
     plan, view = scene.plan_of("hp3_stereo"), View(cell)
@@ -290,3 +292,38 @@ def test_a_seven_joint_arm_whose_flange_leans_is_planned_for(tmp_path):
     assert (np.abs(np.diff(joints[:2, :-1], axis=0)) > 0.01).any()
     for a, b in zip(joints[:-1], joints[1:], strict=True):
         assert arm.path_collision(a, b) is None
+
+
+def test_what_is_planned_next_adds_most_to_what_was_seen():
+    """Two more half-turns after three: better than two of the same plan."""
+    cell, arm = scene.cell_of("hp3_stereo"), scene.arm_of("hp3_stereo")
+    plan = scene.plan_of("hp3_stereo")
+    seen = plan.stations[:6]
+    visited = Visited(
+        np.array([s.base_from_flange.matrix for s in seen]),
+        np.arange(6).reshape(-1, 2),
+        seen[-1].joints,
+    )
+    more = plan_next(cell, arm, visited, 1, 2)
+    assert [s.kind for s in more.stations] == ["calibration"] * 4
+    assert [(t.before, t.after) for t in more.half_turns] == [(0, 1), (2, 3)]
+    model = StationInformation(
+        View(cell), arm.base_from_world.matrix, cell.repeatability, 0.03
+    )
+    five = np.array([s.base_from_flange.matrix for s in plan.stations[:10]])
+    usual = certify(cell, model, five, np.arange(10).reshape(-1, 2)).numbers
+    name = "track_calibration_rms_mm"
+    assert more.certificate[name] < usual[name]
+    assert more.certificate[name] > scene.plan_of("hp3_stereo").certificate[name]
+    before = seen[-1].joints
+    for station, via in zip(more.stations, more.via, strict=True):
+        for a, b in pairwise([before, *via, station.joints]):
+            assert arm.path_collision(a, b) is None
+        before = station.joints
+
+
+def test_no_half_turn_more_is_refused():
+    cell, arm = scene.cell_of("hp3_stereo"), scene.arm_of("hp3_stereo")
+    visited = Visited(np.eye(4)[None], np.zeros((0, 2), dtype=int), arm.home)
+    with pytest.raises(InputError, match="half_turns must be at least 1, got 0"):
+        plan_next(cell, arm, visited, 1, 0)
