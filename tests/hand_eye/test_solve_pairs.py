@@ -59,9 +59,9 @@ def test_every_method_is_exact_on_exact_poses(method):
     found = solve_pose_pairs(
         pairs_of(a, se3_inverse(z) @ a @ x, "eye_to_hand"), method=method
     )
-    np.testing.assert_allclose(found.x.matrix, x, atol=1e-11)
-    np.testing.assert_allclose(found.z.matrix, z, atol=1e-11)
-    assert found.residual_positions.max() < 1e-11
+    np.testing.assert_allclose(found.x.matrix, x, atol=1e-12)
+    np.testing.assert_allclose(found.z.matrix, z, atol=1e-12)
+    assert found.residual_positions.max() < 1e-12
 
 
 @pytest.mark.parametrize("method", ["shah", "park_martin"])
