@@ -288,8 +288,15 @@ def judge(
 
 
 _STYLES: dict[str, dict[str, Any]] = {
-    "paper": {"color": "#999999", "marker": "s", "label": "closed form, paper's"},
-    "whitened": {"color": "#d95f02", "marker": "^", "label": "closed form, whitened"},
+    "paper": {"color": "#999999", "marker": "^", "label": "closed form, paper's"},
+    # Wide, because what is refined runs over it where there are many images.
+    "whitened": {
+        "color": "#f2a65a",
+        "marker": "s",
+        "linewidth": 3.5,
+        "markersize": 6.0,
+        "label": "closed form, whitened",
+    },
     "refined": {"color": "#1f5fa8", "marker": "o", "label": "refined"},
 }
 
@@ -314,9 +321,7 @@ def _drawn(rows: Sequence[Summary], title: str, x_label: str, log_x: bool) -> An
                 panel.plot(
                     x,
                     [getattr(row, statistic) for row in drawn],
-                    linewidth=1.2,
-                    markersize=3.5,
-                    **style,
+                    **{"linewidth": 1.2, "markersize": 3.5, **style},
                 )
             panel.plot(
                 x,

@@ -169,10 +169,11 @@ def off_plane(points: Floats) -> float:
 def _drawn(found: Sequence[Reconstruction], true: float) -> Any:
     figure, axes = new_figure(14.0, 4.6 * len(found), len(found), 3)
     for line, one in zip(axes, found, strict=True):
-        front, above, spread = line
-        _draw_planes(front, above, one)
-        front.set_title(f"{_NAMES[one.views]}: as the left camera sees them")
-        above.set_title("from above: planes tilt, corners stay on them")
+        front, flat, spread = line
+        _draw_planes(front, flat, one)
+        front.set_title(f"{_NAMES[one.views]}: as the left camera sees it")
+        flat.set_title(f"coplanar within {one.off_plane_mm:.2f} mm rms")
+        spread.set_title("distances against the truth")
         distances = one.distances_mm
         spread.hist(distances, 40, color="#1f5fa8")
         spread.axvline(true, color="black", linestyle="--", label=f"truth {true:g} mm")
@@ -185,20 +186,29 @@ def _drawn(found: Sequence[Reconstruction], true: float) -> Any:
     return figure
 
 
-def _draw_planes(front: Any, above: Any, found: Reconstruction) -> None:
+def _draw_planes(front: Any, flat: Any, found: Reconstruction) -> None:
+    """Every view by itself, side by side; and how far corners are off its plane."""
     from matplotlib import colormaps
 
     board = found.seen.board
-    colours = colormaps["viridis"](np.linspace(0, 0.9, len(found.points)))
-    for points, colour in zip(found.points, colours, strict=True):
-        grid = 1e3 * points.reshape(board.rows, board.columns, 3)
-        for panel, vertical in ((front, 1), (above, 2)):
-            for lines in (grid, grid.swapaxes(0, 1)):
-                for line in lines:
-                    x, y = line[:, 0], line[:, vertical]
-                    panel.plot(x, y, color=colour, linewidth=0.7)
+    count = len(found.points)
+    colours = colormaps["viridis"](np.linspace(0, 0.9, count))
+    across = int(np.ceil(np.sqrt(count)))
+    for k, (points, colour) in enumerate(zip(found.points, colours, strict=True)):
+        own = 1e3 * (points - points.mean(axis=0))
+        place = np.array([k % across, k // across, 0]) * (330.0, 260.0, 0.0)
+        grid = (own + place).reshape(board.rows, board.columns, 3)
+        for lines in (grid, grid.swapaxes(0, 1)):
+            for line in lines:
+                front.plot(line[:, 0], line[:, 1], color=colour, linewidth=0.7)
+        label = found.seen.names[k]
+        front.text(*place[:2], label, fontsize=8, ha="center", va="center", zorder=5)
+        axes = np.linalg.svd(own, full_matrices=False)[2]
+        flat.plot(own @ axes[0], own @ axes[2], ".", color=colour, markersize=3)
     front.invert_yaxis()
-    for panel, name in ((front, "y (down)"), (above, "z (forward)")):
-        panel.set_aspect("equal")
-        panel.set_xlabel("x, mm")
-        panel.set_ylabel(f"{name}, mm")
+    front.set_aspect("equal")
+    front.set_xlabel("x, mm (views side by side)")
+    front.set_ylabel("y (down), mm")
+    flat.axhline(0, color="black", linewidth=0.8)
+    flat.set_xlabel("along the plane, mm")
+    flat.set_ylabel("distance of corners from their plane, mm")

@@ -23,13 +23,16 @@ _PAGE = """<!doctype html>
 <style>
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 76rem; margin: 2rem auto;
   padding: 0 1rem; color: #1c1c1c; background: #fff; }
-img { width: 100%; height: auto; }
+img { display: block; width: 100%; min-width: 44rem; height: auto; }
+/* Wider than a phone: moved by the finger, not shrunk until nobody can read it. */
+.wide { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .2rem .7rem; text-align: right; border-bottom: 1px solid #ddd; }
 th:first-child, td:first-child { text-align: left; }
 .verdict { padding: .4rem .8rem; border-left: .4rem solid #888; background: #f5f5f5; }
 .PASS { border-color: #2e7d32; } .FAIL { border-color: #c62828; }
 h2 { margin-top: 3rem; }
+@media (max-width: 40rem) { h1 { font-size: 1.5rem; } h2 { font-size: 1.2rem; } }
 </style>
 </head>
 <body>
@@ -46,13 +49,16 @@ motions (2008), Sec. IV, done again with bounds on what any estimate can reach.<
 <h2 id="{{ outcome.name }}">{{ outcome.title }}</h2>
 <p class="verdict {{ outcome.verdict }}"><strong>{{ outcome.verdict }}.</strong>
 {{ outcome.sentence }}</p>
-<img alt="{{ outcome.title }}" src="{{ pictures[loop.index0] }}">
+<div class="wide"><img alt="{{ outcome.title }}" src="{{ pictures[loop.index0] }}">
+</div>
 {% set table = tables[loop.index0] %}
-{% if table|length <= longest %}<table>
+{% if table|length <= longest %}<div class="wide"><table>
 {% for line in table %}<tr>{% for cell in line %}
 <td>{{ cell }}</td>{% endfor %}</tr>
-{% endfor %}</table>
+{% endfor %}</table></div>
 {% else %}<p>{{ table|length - 1 }} rows in {{ outcome.files[0].name }}.</p>{% endif %}
+{% if outcome.files|length > 4 %}<p>To look at: {{ outcome.files[4].name }}
+(<code>rerun {{ outcome.files[4].name }}</code>).</p>{% endif %}
 {% endfor %}
 </body>
 </html>
