@@ -110,7 +110,11 @@ class RobotParameters:
         )
 
     def at(self, stations: ArrayLike) -> RobotParameters:
-        """The same parameters at some of the stations, in any order, by index."""
+        """The same parameters at some of the stations.
+
+        Args:
+            stations: Their indices in any order, shape (k,).
+        """
         index = np.asarray(stations, dtype=np.intp)
         whole = self.kinematics
 
