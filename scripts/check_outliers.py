@@ -3,8 +3,9 @@
 Four of twenty half-turns bad: root mean square errors of (fx, fy, skew, cx, cy) over
 those of the sixteen good ones alone; bad ones kept, bad ones dropped for a reason that
 is not theirs, good ones dropped, failed runs. Exits with 1 where a ratio is above 1.2,
-a bad one is kept, a run failed, or good half-turns are dropped: more than one, and one
-in a thousand.
+a run failed, more than one in fifty bad ones is kept (a turn of 170 degrees about an
+edge can look like one of 180 to within the noise), or good half-turns are dropped: more
+than one, and one in a thousand.
 
     python scripts/check_outliers.py [--trials 50] [--healthy 200]
 """
@@ -38,6 +39,7 @@ from handeye_tri.triangle import AXES  # noqa: E402
 DAMAGES = (wrong_point, swapped, repeated, turned_by_170)
 MAX_RATIO = 1.2
 MAX_LOST = 1e-3
+MAX_KEPT = 0.02
 
 
 def run(axis: str, damage: Callable[..., str] | None, trials: int) -> bool:
@@ -83,7 +85,8 @@ def run(axis: str, damage: Callable[..., str] | None, trials: int) -> bool:
         + f"{kept:10}{misnamed:10}{lost:13}{failed:7}{1e3 * spent / trials:6.0f}",
         flush=True,
     )
-    clean = kept == 0 and failed == 0 and lost <= 1 + MAX_LOST * good_ones
+    clean = kept <= MAX_KEPT * 4 * trials and failed == 0
+    clean &= lost <= 1 + MAX_LOST * good_ones
     return clean and bool(ratio.max() <= MAX_RATIO)
 
 

@@ -144,31 +144,42 @@ def _exchanged(
 
 
 def _other_angle(data: HalfTurnData, build: Build, consensus: Consensus) -> str | None:
+    """The angle nearest to 180 degrees by which it may have been turned instead.
+
+    About an edge there can be two angles that fit.
+    """
     found = own_homography(data, None)
     if found is None:
         return None
     foot = consensus.state.o[0]
-    best, lowest = 180.0, np.inf
-    for angles in (_ANGLES, _CLOSER):
-        tried = angles if angles is _ANGLES else best + angles
-        count = len(tried)
-        many = data.take(np.zeros(count, dtype=np.intp))
-        rotation, offset = _turns(data, foot, tried)
+
+    def squares(angles: Floats) -> Floats:
+        count = len(angles)
+        rows = np.zeros(count, dtype=np.intp)
+        rotation, offset = _turns(data, foot, angles)
         many = replace(
-            many, rotation=rotation, offset=offset, about_normal=np.zeros(count)
+            data.take(rows),
+            rotation=rotation,
+            offset=offset,
+            about_normal=np.zeros(count),
         )
-        model = build(many, np.zeros(count, dtype=np.intp))
+        model = build(many, rows)
         state = fit_poses(model, joined([found] * count), consensus.state)
         blocks = None if state is None else model.evaluate(state)
         if blocks is None:
-            return None
-        square = (blocks.residuals**2).sum(axis=1)
-        index = int(np.argmin(square))
-        best, lowest = float(tried[index]), float(square[index])
-    # The grid is a twentieth of a degree fine, a matter of pixels at most.
-    if lowest > 4.0 * consensus.limit(5) or abs(best - 180.0) < 0.2:
-        return None
-    return f"a turn of {min(best, 360.0 - best):.1f} degrees, not 180"
+            return np.full(count, np.inf)
+        return np.asarray((blocks.residuals**2).sum(axis=1))
+
+    coarse = squares(_ANGLES)
+    padded = np.concatenate([[np.inf], coarse, [np.inf]])
+    lowest = (coarse <= padded[:-2]) & (coarse <= padded[2:]) & np.isfinite(coarse)
+    for start in sorted(_ANGLES[lowest], key=lambda angle: abs(angle - 180.0)):
+        fine = squares(start + _CLOSER)
+        best = float(start + _CLOSER[np.argmin(fine)])
+        # The grid is a twentieth of a degree fine, a matter of pixels at most.
+        if fine.min() <= 4.0 * consensus.limit(5) and abs(best - 180.0) >= 0.2:
+            return f"a turn of {min(best, 360.0 - best):.1f} degrees, not 180"
+    return None
 
 
 def _turns(data: HalfTurnData, foot: Floats, angles: Floats) -> tuple[Floats, Floats]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
 
 from handeye_tri.calibrate_cameras.closed_form import NOMINAL_FOCAL
-from handeye_tri.calibrate_cameras.degeneracy import is_turn
+from handeye_tri.calibrate_cameras.degeneracy import is_turn, least_noise
 from handeye_tri.calibrate_cameras.extrinsics import poses_from_homographies
 from handeye_tri.calibrate_cameras.half_turns import HalfTurnData
 from handeye_tri.calibrate_cameras.homography import (
@@ -43,11 +43,15 @@ Indices = NDArray[np.intp]
 _MAJORITY = 0.75
 _SUBSETS = 60
 # Chance that a good half-turn is dropped, if noise is normal and as stated.
-_CHANCE = 1e-5
+_CHANCE = 1e-4
 # Observations of a half-turn less its pose, camera and O being known.
 _FREEDOM = 6
 # Of a median of chi-squares of that freedom against their mean.
 _MEDIAN_EFFICIENCY = 0.58
+# Standard deviations of that median by which stated noise is contradicted.
+_CONTRADICTION = 2.33
+# Part of a residual's variance that is taken to be left at least.
+_LEAST_LEFT = 1e-3
 # Variance over what was stated beyond which nothing has been agreed upon.
 _MAX_SCALE = 1e4
 
@@ -63,7 +67,8 @@ class Consensus:
         lost: Rows of the others.
         state: Camera, poses and O from those kept.
         scale: Factor by which the noise exceeds what was stated, squared.
-        votes: Half-turns that this factor was estimated from.
+        votes: Half-turns that this factor was estimated from, none where the noise
+            is as stated.
     """
 
     kept: Indices
@@ -124,8 +129,8 @@ def find_consensus(
         # The core is the best part, at worst: its median is no median of them all.
         expected = chdtri(freedom, 1.0 - 0.5 * _MAJORITY)
         typical = float(np.median((square / expected)[np.isin(sound, core)]))
-        scale = max(1.0, typical)
-        excess = square / _limits(freedom, scale, len(core))
+        scale, votes = _noise(typical, len(core), noise_known)
+        excess = square / _limits(freedom, scale, votes)
         good = sound[excess <= 1.0]
         if len(good) < least:
             good = np.sort(sound[np.argsort(excess)[:least]])
@@ -135,7 +140,24 @@ def find_consensus(
     if noise_known and scale > _MAX_SCALE:
         raise _no_majority(n, int((square <= chdtri(freedom, _CHANCE)).sum()))
     lost = np.setdiff1d(np.arange(n), kept)
-    return Consensus(kept, lost, state, scale, len(core))
+    return Consensus(kept, lost, state, scale, votes)
+
+
+def _noise(typical: float, votes: int, noise_known: bool) -> tuple[float, int]:
+    """By how much the noise exceeds what was stated, and how many say so.
+
+    Noise that was stated is believed unless the half-turns contradict it: their
+    median is more than chance makes it in 1 of 100 data sets.
+
+    Args:
+        typical: Median chi-square of the half-turns over what is expected.
+        votes: How many half-turns that is the median of.
+        noise_known: Whether the noise was stated at all.
+    """
+    if not noise_known:
+        return max(typical, least_noise(0.0, noise_known)), votes
+    spread = np.sqrt(2.0 / (_MEDIAN_EFFICIENCY * _FREEDOM * votes))
+    return (1.0, 0) if typical <= 1.0 + _CONTRADICTION * spread else (typical, votes)
 
 
 def _limits(freedom: Floats, scale: float, votes: int) -> Floats:
@@ -147,9 +169,10 @@ def _limits(freedom: Floats, scale: float, votes: int) -> Floats:
     Args:
         freedom: Of each chi-square, any shape.
         scale: Factor by which the noise exceeds what was stated, squared.
-        votes: Half-turns that this factor was estimated from.
+        votes: Half-turns that this factor was estimated from, none where the noise
+            is as stated.
     """
-    if scale <= 1.0:
+    if votes == 0:
         return np.asarray(chdtri(freedom, _CHANCE))
     known = _MEDIAN_EFFICIENCY * _FREEDOM * votes
     return np.asarray(scale * freedom * fdtri(freedom, known, 1.0 - _CHANCE))
@@ -227,7 +250,13 @@ def _misfits(
     state: State,
     kept: Indices,
 ) -> Floats:
-    """Chi-square of each of the rows against camera and O of a state, shape (r,)."""
+    """Chi-square of each of the rows against what the others say, shape (r,).
+
+    The residuals of a row that the camera and O were estimated from are smaller than
+    those against an estimate without it: they spread by I - L S L', those of the other
+    rows by I + L S L', with S the covariance of camera and O and L their effect. So
+    weighed, either is the chi-square of the row against an estimate without it.
+    """
     whole = build(data.take(rows), rows)
     fitted = fit_poses(whole, joined(each), state)
     if fitted is None:
@@ -240,11 +269,12 @@ def _misfits(
     # What of the camera's change a pose cannot take up.
     pose = np.linalg.pinv(blocks.own)
     left = blocks.shared - blocks.own @ (pose @ blocks.shared)
-    wide = np.eye(blocks.residuals.shape[1]) + left @ spread @ np.swapaxes(left, 1, 2)
+    sign = np.where(np.isin(rows, kept), -1.0, 1.0)[:, None, None]
+    # Where the camera hangs on one row alone, nothing else can judge it.
+    unit = (1.0 + _LEAST_LEFT) * np.eye(blocks.residuals.shape[1])
+    wide = unit + sign * (left @ spread @ np.swapaxes(left, 1, 2))
     solved = np.linalg.solve(wide, blocks.residuals[..., None])[..., 0]
-    outside = (blocks.residuals * solved).sum(axis=1)
-    inside = (blocks.residuals**2).sum(axis=1)
-    return np.asarray(np.where(np.isin(rows, kept), inside, outside))
+    return np.asarray((blocks.residuals * solved).sum(axis=1))
 
 
 def joined(each: list[Homographies]) -> Homographies:

@@ -53,6 +53,30 @@ def test_four_of_twenty_bad_are_named_and_do_no_harm(axis, damage) -> None:
     assert ratio.max() < 1.2
 
 
+def test_bad_half_turns_that_pull_the_camera_towards_them_are_found() -> None:
+    rng = np.random.default_rng([11, 20])
+    scene = make_scene(rng, 20, "AB")
+    before, after = scene.noisy(rng, SIGMA)
+    bad = rng.choice(20, 4, replace=False)
+    for i in bad:
+        turned_by_170(scene, before, after, i, rng)
+    dropped = calibrate(scene, before, after, reject=True).details["dropped"]
+    assert sorted(dropped) == sorted(bad.tolist())
+
+
+def test_noise_that_is_not_stated_is_taken_from_the_half_turns() -> None:
+    rng = np.random.default_rng(9)
+    scene = make_scene(rng, 14)
+    before, after = scene.noisy(rng, 0.02)
+    # Forty sigmas, but less than a pixel.
+    after[5, 1] += (0.8, 0.0)
+    dropped = calibrate(scene, before, after, reject=True, sigma_px=None).details[
+        "dropped"
+    ]
+    assert list(dropped) == [5]
+    assert "marker B after it is 0.8 px off" in dropped[5]
+
+
 def test_angle_of_a_turn_about_the_normal_is_said() -> None:
     rng = np.random.default_rng(2)
     scene = make_scene(rng, 12)
