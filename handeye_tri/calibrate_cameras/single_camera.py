@@ -35,6 +35,7 @@ from handeye_tri.calibrate_cameras.intrinsic_choice import (
     split_fixed,
 )
 from handeye_tri.calibrate_cameras.least_squares import NormalEquations
+from handeye_tri.calibrate_cameras.lens_selection import lens_advice
 from handeye_tri.calibrate_cameras.lens_verdict import judge_lens
 from handeye_tri.calibrate_cameras.options import (
     lens_choice,
@@ -132,7 +133,7 @@ def calibrate_camera(
             for errors with heavy tails. ``chi2`` is then the sum of the losses.
         reject: Leave out half-turns that disagree with the others: a wrong point,
             exchanged labels, a repeated image, a turn by another angle. A quarter of
-            them may be bad. A good one is dropped with a chance of about 1e-5 where
+            them may be bad. A good one is dropped with a chance of about 1e-4 where
             the noise is normal and as stated.
         name: The camera's name in the covariance labels.
 
@@ -239,7 +240,17 @@ def calibrate_camera(
     if first is not None and not refine:
         outcome = _stop_at_closed_form(model, zero, first, homographies, noise_known)
     else:
-        outcome = _refined(model, zero, first, homographies, noise_known)
+        starts = refinement_starts(model, zero, first, homographies)
+        try:
+            outcome = _refined(model, starts, noise_known)
+        except (DegenerateMotionError, ConvergenceError) as error:
+            advice = None
+            if len(lens) > 1:
+                every = list(starts.values())
+                advice = lens_advice(model, every, lens_model, noise_known)
+            if advice is None:
+                raise
+            raise type(error)(f"{error}. {advice}") from error
     camera = PinholeCamera(
         name,
         Intrinsics.from_vector(outcome.state.intrinsics),
@@ -336,13 +347,8 @@ def _stop_at_closed_form(
 
 
 def _refined(
-    model: HalfTurnModel,
-    zero: State,
-    first: ClosedForm | None,
-    homographies: Homographies,
-    noise_known: bool,
+    model: HalfTurnModel, starts: dict[str, State], noise_known: bool
 ) -> _Outcome:
-    starts = refinement_starts(model, zero, first, homographies)
     found = refine_from_starts(model, list(starts.values()))
     if found is None:
         raise DegenerateMotionError(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
+import pytest
 from half_turn_scene import IMAGE_SIZE, camera, make_scene
 
 from handeye_tri.calibrate_cameras import calibrate_camera
@@ -92,3 +95,26 @@ def test_coefficients_that_cannot_be_told_apart_are_said_to_be_the_lens() -> Non
     assert said
     assert all("estimate fewer" in text for text in said)
     assert any("do not tell 8 lens coefficients apart" in text for text in said)
+    # There is none: at 1 in 100 for each of eight, one may seem to be.
+    assert sum("The data determine no coefficient" in text for text in said) >= 1
+
+
+def test_refusal_says_which_coefficients_the_data_determine() -> None:
+    lens = Lens("rational", np.array([-0.25, 0, 0, 0, 0, 0, 0, 0]))
+    rng = np.random.default_rng(9)
+    scene = make_scene(rng, 14, view=camera(lens=lens), sideways=0.2)
+    seen = scene.noisy(rng, 0.02)
+    options = {"image_size": IMAGE_SIZE, "sigma_px": 0.02}
+    with pytest.raises((DegenerateMotionError, ConvergenceError)) as caught:
+        calibrate_camera(*seen, scene.triangle, distortion="rational", **options)
+    found = re.search(
+        r"The data determine distortion=\((.*),\); chi2", str(caught.value)
+    )
+    assert found
+    names = re.findall(r"k\d|p\d", found[1])
+    assert 1 <= len(names) <= 2
+    assert set(names) & {"k1", "k4"}
+    result = calibrate_camera(*seen, scene.triangle, distortion=names, **options)
+    assert f"chi2 is then {result.chi2:.4g} for {result.dof} degrees" in str(
+        caught.value
+    )
