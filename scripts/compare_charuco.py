@@ -15,6 +15,9 @@ themselves; "own part": the same with exact pixels, which leaves the calibration
 the flange is used for both). Beside that, errors against the truth: focal lengths,
 baseline, and the left camera's position and rotation in the base.
 
+Without names of cells there are three: pinholes, lenses, and those lenses on sensors
+with square pixels, since OpenCV has no skew factor and the cell with lenses has one.
+
 OpenCV 5 has no hand-eye solvers in Python: --peer-python names an interpreter with
 OpenCV 4. Without it this project's own AX=XB and AX=ZB solvers take their place: Park's
 and Daniilidis's give the same to 1e-8 m, the others weigh noise a little differently.
@@ -23,6 +26,7 @@ What is in the folder is not done again.
 
 import argparse
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -286,11 +290,11 @@ def score(calibration, session: Session, truth: GroundTruth):
 
 def one(name, seed, folder, peer):
     """All methods on one cell and seed."""
-    kept = folder / f"{name}_{seed}" / "scores.json"
+    kept = folder / f"{Path(name).stem}_{seed}" / "scores.json"
     by = "peer" if peer else "own"
     if kept.is_file() and (old := json.loads(kept.read_text()))["solvers"] == by:
         return old
-    balls = folder / f"{name}_{seed}" / "balls"
+    balls = kept.with_name("balls")
     run = Run(start(name, balls, seed, None), NullProgress())
     with run.folder.locked():
         execute(run, STAGES, ("plan", "simulate", "detect", "calibrate"), again=False)
@@ -319,6 +323,15 @@ def one(name, seed, folder, peer):
     }
     storage.write_json(kept, result)
     return result
+
+
+def with_square_pixels(folder):
+    """The cell with lenses, without the skew that OpenCV's cameras do not have."""
+    text = storage.find_cell("hp3_stereo_lens").read_text()
+    text = re.sub(r"(?m)^    skew_px:.*\n", "", text)
+    path = folder / "hp3_stereo_lens_square.yaml"
+    storage.write_bytes(path, text.replace("hp3_stereo_lens", path.stem, 1).encode())
+    return str(path)
 
 
 def table(name, seeds, results):
@@ -366,7 +379,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("cells", nargs="*", default=["hp3_stereo", "hp3_stereo_lens"])
+    parser.add_argument("cells", nargs="*", help="names or paths; default: three")
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--seeds", default="1-5", help="first-last")
     parser.add_argument("--peer-python", help="an interpreter with OpenCV 4")
@@ -377,13 +390,18 @@ def main() -> None:
         "hand-eye by "
         + ("OpenCV's own solvers" if peer else "this project's solvers in their place")
     )
-    for name in options.cells:
+    cells = options.cells or [
+        "hp3_stereo",
+        "hp3_stereo_lens",
+        with_square_pixels(options.output),
+    ]
+    for name in cells:
         results = []
         for seed in range(first, last + 1):
             results.append(one(name, seed, options.output, peer))
             print(f"{name} {seed} done", file=sys.stderr, flush=True)
-        rows = table(name, options.seeds, results)
-        print(sentence(name, rows), flush=True)
+        rows = table(Path(name).stem, options.seeds, results)
+        print(sentence(Path(name).stem, rows), flush=True)
 
 
 if __name__ == "__main__":
