@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 Floats = NDArray[np.float64]
 
@@ -215,6 +217,36 @@ def minimise(
     Returns:
         The minimum; None where the start cannot be evaluated.
     """
+    # Many products of small matrices: threads cost more than they bring.
+    with _blas().limit(limits=1):
+        return _minimise(
+            evaluate,
+            retract,
+            start,
+            rounding,
+            known,
+            max_iterations,
+            tolerance,
+            damping,
+        )
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """The libraries behind numpy, found once."""
+    return ThreadpoolController().select(user_api="blas")
+
+
+def _minimise(
+    evaluate: Callable[[State], Rows | None],
+    retract: Callable[[State, Floats, Floats], State],
+    start: State,
+    rounding: float,
+    known: float | None,
+    max_iterations: int,
+    tolerance: float,
+    damping: float,
+) -> Minimum[State, Rows] | None:
     blocks = evaluate(start)
     if blocks is None:
         return None

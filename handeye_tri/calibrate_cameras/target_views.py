@@ -42,8 +42,9 @@ Floats = NDArray[np.float64]
 # A view of fewer points says less than its pose asks.
 _LEAST_POINTS = 4
 _LEAST_VIEWS = 3
-# The last step is at most a thousandth of its sigma; the one after would be far less.
-_TOLERANCE = 1e-6
+# The last step of all unknowns together is at most a hundredth of their sigma, and the
+# one after would be a tenth of it or less.
+_TOLERANCE = 1e-4
 # Points whose smaller spread is less than this part of the larger are on a line.
 _MIN_WIDTH = 1e-3
 
