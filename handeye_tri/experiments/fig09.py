@@ -196,7 +196,7 @@ def _draw_planes(front: Any, flat: Any, found: Reconstruction) -> None:
     across = int(np.ceil(np.sqrt(count)))
     for k, (points, colour) in enumerate(zip(found.points, colours, strict=True)):
         own = 1e3 * (points - points.mean(axis=0))
-        place = np.array([k % across, k // across, 0]) * (330.0, 260.0, 0.0)
+        place = np.array([k % across, k // across, 0]) * (330.0, 300.0, 0.0)
         grid = (own + place).reshape(board.rows, board.columns, 3)
         for lines in (grid, grid.swapaxes(0, 1)):
             for line in lines:
