@@ -47,6 +47,7 @@ def examine() -> tuple[Check, ...]:
         check_vulkan(),
         check_viewer(),
         check_browser(),
+        check_recordings(),
     )
 
 
@@ -220,3 +221,26 @@ def _run(command: list[str]) -> tuple[str, bool]:
         return str(error), False
     ok = done.returncode == 0
     return (done.stdout if ok else done.stderr).strip(), ok
+
+
+def check_recordings() -> Check:
+    """What ROS recordings are read and written with."""
+    lacking = [
+        package
+        for module, package in (
+            ("mcap", "mcap"),
+            ("mcap_ros2", "mcap-ros2-support"),
+            ("rosbags", "rosbags"),
+        )
+        if importlib.util.find_spec(module) is None
+    ]
+    if not lacking:
+        text = f"rosbags {importlib.metadata.version('rosbags')}"
+        return Check("ROS recordings", True, text, optional=True)
+    return Check(
+        "ROS recordings",
+        False,
+        f"{', '.join(lacking)} absent",
+        'install them with: pip install "handeye-tri[ros]"',
+        optional=True,
+    )

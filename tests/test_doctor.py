@@ -23,7 +23,7 @@ def fake_distribution(folder: Path, *requirements: str) -> str:
 def test_examine_looks_at_everything_once() -> None:
     """The test machine has what is needed: scripts/setup.sh put it there."""
     checks = doctor.examine()
-    assert len({check.name for check in checks}) == len(checks) == 6
+    assert len({check.name for check in checks}) == len(checks) == 7
     assert [check for check in checks if not check.ok and not check.optional] == []
     assert all(check.found for check in checks)
     assert all(bool(check.remedy) != check.ok for check in checks)
@@ -115,3 +115,17 @@ def test_no_browser(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chromium.write_text("#!/bin/sh\n")
     chromium.chmod(0o755)
     assert doctor.check_browser().found == str(chromium)
+
+
+def test_without_the_extra_ros_it_says_how_to_get_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert doctor.check_recordings().ok
+    monkeypatch.setattr(
+        doctor.importlib.util, "find_spec", lambda name: None if "mcap" in name else 1
+    )
+    check = doctor.check_recordings()
+    assert not check.ok
+    assert check.optional
+    assert check.found == "mcap, mcap-ros2-support absent"
+    assert 'pip install "handeye-tri[ros]"' in check.remedy

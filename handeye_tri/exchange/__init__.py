@@ -8,7 +8,7 @@ from handeye_tri.exchange.camera_info import camera_info_yaml
 from handeye_tri.exchange.easy_handeye2 import easy_handeye2_calib
 from handeye_tri.exchange.everything import EXPORT_SCHEMA, json_schema
 from handeye_tri.exchange.kalibr import kalibr_yaml
-from handeye_tri.exchange.mcap_bag import Bag, session_mcap
+from handeye_tri.exchange.mcap_bag import Bag, session_mcap, session_rosbag2
 from handeye_tri.exchange.opencv import opencv_yaml
 from handeye_tri.exchange.results import FrameNames, Results
 from handeye_tri.exchange.robot_description import link_names, robot_urdf
@@ -31,6 +31,7 @@ __all__ = [
     "opencv_yaml",
     "robot_urdf",
     "session_mcap",
+    "session_rosbag2",
     "static_tf_commands",
     "static_tf_launch",
     "tum_tracks",

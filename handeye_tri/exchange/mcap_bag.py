@@ -71,6 +71,60 @@ def import_ros() -> tuple[Any, Any]:
     return writer, typesys
 
 
+# What late listeners must get, too.
+_LATCHED = ("/tf_static", "/robot_description", SESSION_TOPIC)
+
+
+def _quality_of_service(topic: str) -> str:
+    """As rosbag2 notes it: reliable; durability 1 is kept for late listeners, 2 not."""
+    depth, durability = (1, 1) if topic in _LATCHED else (10, 2)
+    no_limit = "{sec: 9223372036, nsec: 854775807}"
+    return (
+        f"- {{history: 1, depth: {depth}, reliability: 1, durability: {durability}, "
+        f"deadline: {no_limit}, lifespan: {no_limit}, liveliness: 1, "
+        f"liveliness_lease_duration: {no_limit}, "
+        "avoid_ros_namespace_conventions: false}"
+    )
+
+
+def session_rosbag2(bag: Bag, name: str) -> dict[str, bytes]:
+    """The files of a rosbag2 folder called ``name``.
+
+    Raises:
+        MissingDependencyError: the extra ``ros`` is not installed.
+    """
+    counts: dict[str, tuple[str, int]] = {}
+    times = []
+    for topic, kind, time, _ in _messages(bag):
+        counts[topic] = (kind, counts.get(topic, (kind, 0))[1] + 1)
+        times.append(time)
+    file = f"{name}_0.mcap"
+    span = (
+        f"{{nanoseconds_since_epoch: {min(times)}}}",
+        f"{{nanoseconds: {max(times) - min(times)}}}",
+    )
+    text = (
+        "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n"
+        f"  duration: {span[1]}\n  starting_time: {span[0]}\n"
+        f"  message_count: {len(times)}\n  topics_with_message_count:\n"
+    )
+    for topic, (kind, count) in counts.items():
+        text += (
+            f"    - topic_metadata:\n        name: {topic}\n"
+            f"        type: {kind.replace('/', '/msg/')}\n"
+            "        serialization_format: cdr\n"
+            f'        offered_qos_profiles: "{_quality_of_service(topic)}"\n'
+            f"      message_count: {count}\n"
+        )
+    text += (
+        '  compression_format: ""\n  compression_mode: ""\n'
+        f"  relative_file_paths: [{file}]\n  files:\n    - path: {file}\n"
+        f"      starting_time: {span[0]}\n      duration: {span[1]}\n"
+        f"      message_count: {len(times)}\n"
+    )
+    return {file: session_mcap(bag), "metadata.yaml": text.encode()}
+
+
 def session_mcap(bag: Bag) -> bytes:
     """The file, with a CRC over every chunk, the data and the summary.
 

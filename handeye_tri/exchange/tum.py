@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from handeye_tri.exchange.results import Results, number
+import numpy as np
+
+from handeye_tri.exchange.results import Results
 from handeye_tri.records import Floats
-from handeye_tri.se3 import quaternion_wxyz
+from handeye_tri.storage import tum_text
 
 
 def tum_tracks(results: Results) -> dict[str, str]:
@@ -32,10 +34,4 @@ def tum_tracks(results: Results) -> dict[str, str]:
 
 
 def _track(lines: list[str], times: Sequence[int], poses: Floats) -> str:
-    text = "".join(f"# {line}\n" for line in lines)
-    text += "# t (station number) x y z (m) qx qy qz qw\n"
-    for time, pose in zip(times, poses, strict=True):
-        w, x, y, z = quaternion_wxyz(pose[:3, :3])
-        row = [time, *pose[:3, 3], x, y, z, w]
-        text += " ".join(number(v) for v in row) + "\n"
-    return text
+    return tum_text(np.array(times, dtype=float), poses, lines)

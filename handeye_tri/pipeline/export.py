@@ -35,7 +35,7 @@ FORMATS = {
     "ros2_static_tf": "ROS 2 static transforms: launch file with the commands",
     "urdf": "URDF joints from the base to the cameras",
     "tum": "TUM trajectories: the robot's and the observed track",
-    "mcap": "the whole session as a rosbag2/MCAP recording",
+    "mcap": "the whole session as an MCAP file, or as a rosbag2 folder",
     "json": "everything, with its JSON Schema beside it",
 }
 # A JSON text of these and no more is what other tools get of session.json.
@@ -113,6 +113,7 @@ def export(
         run: A session that is evaluated.
         name: One of FORMATS.
         path: The file; where a format has several, each gets a name before the suffix.
+            For "mcap" without a suffix, the folder of a rosbag2.
         frames: What the frames are called.
         camera_frame: For URDF, where its joint ends.
 
@@ -127,8 +128,14 @@ def export(
         raise StorageError(f"{path}: this is a folder; name a file with -o")
     results = read_results(run, frames)
     if name == "mcap":
-        storage.write_bytes(path, exchange.session_mcap(_bag(run, results)))
-        return [path], results
+        bag = _bag(run, results)
+        if path.suffix:
+            storage.write_bytes(path, exchange.session_mcap(bag))
+            return [path], results
+        files = exchange.session_rosbag2(bag, path.name)
+        for label, data in files.items():
+            storage.write_bytes(path / label, data)
+        return [path / label for label in files], results
     writers: dict[str, Callable[[], str | Mapping[str, str]]] = {
         "camera_info": lambda: exchange.camera_info_yaml(results),
         "opencv": lambda: exchange.opencv_yaml(results),

@@ -28,7 +28,7 @@ from handeye_tri.storage.pose_files import (
     read_pose_pairs,
 )
 from handeye_tri.storage.structured import read_structured
-from handeye_tri.storage.trajectories import write_tum
+from handeye_tri.storage.trajectories import tum_text, write_tum
 
 __all__ = [
     "POSES_SCHEMA",
@@ -51,6 +51,7 @@ __all__ = [
     "read_structured",
     "sha256",
     "shipped",
+    "tum_text",
     "write_arrays",
     "write_bytes",
     "write_image",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +26,20 @@ def write_tum(path: Path, times: Floats, poses: Floats, remark: str) -> None:
     Raises:
         StorageError: it cannot be written.
     """
-    lines = [f"# {remark}", "# t x y z qx qy qz qw"]
+    write_bytes(path, tum_text(times, poses, [remark]).encode())
+
+
+def tum_text(times: Floats, poses: Floats, remarks: Sequence[str]) -> str:
+    """What such a file holds.
+
+    Args:
+        times: Shape (n,), increasing; written to a tenth.
+        poses: Shape (n, 4, 4), metres.
+        remarks: Lines for its head.
+    """
+    lines = [*(f"# {remark}" for remark in remarks), "# t x y z qx qy qz qw"]
     for time, pose in zip(times.tolist(), poses, strict=True):
         w, x, y, z = quaternion_wxyz(pose[:3, :3]).tolist()
         row = [f"{time:.1f}", *map(repr, (*pose[:3, 3].tolist(), x, y, z, w))]
         lines.append(" ".join(row))
-    write_bytes(path, ("\n".join(lines) + "\n").encode())
+    return "\n".join(lines) + "\n"

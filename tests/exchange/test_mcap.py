@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pinocchio as pin
 import pytest
+import yaml
 from drawn_session import drawn_session
 from exported import call, exported
 from finished_session import mechanism as every_shape
@@ -212,3 +213,22 @@ def test_frames_of_ones_own(capsys, tmp_path):
                     (t.header.frame_id, t.child_frame_id) for t in message.transforms
                 }
     assert ("base_link", "tool0") in pairs
+
+
+def test_a_rosbag2_folder_holds_the_same_messages(bag, capsys, tmp_path):
+    run, _, topics = bag
+    folder = tmp_path / "session"
+    code, out, _ = call(capsys, "export", run.folder.path, "mcap", "-o", folder)
+    assert code == 0
+    assert f"wrote {folder / 'metadata.yaml'}" in out
+    with AnyReader([folder]) as reader:
+        found = {c.topic: c.msgcount for c in reader.connections}
+        assert found == {topic: len(rows) for topic, rows in topics.items()}
+        assert reader.message_count == sum(found.values())
+    information = yaml.safe_load((folder / "metadata.yaml").read_text())
+    metadata = information["rosbag2_bagfile_information"]
+    for row in metadata["topics_with_message_count"]:
+        (qos,) = yaml.safe_load(row["topic_metadata"]["offered_qos_profiles"])
+        late = row["topic_metadata"]["name"] in ("/tf_static", "/robot_description")
+        if late:
+            assert (qos["durability"], qos["depth"]) == (1, 1)
