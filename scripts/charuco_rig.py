@@ -124,7 +124,7 @@ def plan_board(cell: Cell, arm: Arm, stations: int, seed: int) -> Plan:
     found: list[Station] = []
     for _ in range(_MOST):
         poses = view.draw(rng, _BATCH)
-        keep = view.tilt_allowed(poses)
+        keep = view.tilt_allowed(poses).all(axis=1)
         for camera, pose in zip(view.cameras, view.world_from_camera, strict=True):
             world = corners @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
             local = (world - pose[:3, 3]) @ pose[:3, :3]

@@ -49,7 +49,10 @@ def random_plans(
         view, arm.base_from_world.matrix, cell.repeatability, sigma_px
     )
     design = Design(
-        model.of_half_turns(np.array([c.base_from_flange for c in found])),
+        model.of_half_turns(
+            np.array([c.base_from_flange for c in found]),
+            np.array([c.seen for c in found]),
+        ),
         model.prior,
         model.workspace_cost,
     )

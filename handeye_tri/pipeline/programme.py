@@ -41,7 +41,8 @@ def plan_more(run: Run, half_turns: int) -> Plan:
 
     run.folder.require("detect")
     session = run.observed()
-    seen = np.asarray(np.isfinite(session.pixels).all(axis=(2, 3)).any(axis=0))
+    views = np.asarray(np.isfinite(session.pixels).all(axis=(2, 3)).T)
+    seen = np.asarray(views.any(axis=1))
     used = [
         k for k, s in enumerate(session.stations) if s.kind == "calibration" and seen[k]
     ]
@@ -54,6 +55,7 @@ def plan_more(run: Run, half_turns: int) -> Plan:
     last = max(np.flatnonzero(seen), default=None)
     visited = Visited(
         session.base_from_flange[used].reshape(-1, 4, 4),
+        views[used].reshape(-1, len(session.cameras)),
         np.array(turns, dtype=np.intp).reshape(-1, 2),
         run.arm.home if last is None else session.stations[last].joints,
     )

@@ -13,6 +13,7 @@ from handeye_tri.arm import Arm
 from handeye_tri.plan.poses import HALF_TURN, View
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 # Poses drawn at once, and at most, until enough pass.
 _BATCH = 400
@@ -37,12 +38,14 @@ class Prospect:
     Attributes:
         base_from_flange: Shape (s, 4, 4), metres: s = 2 before and after a
             half-turn, else 1.
+        seen: Which cameras have all markers well in their images, shape (m,).
         before: Joints by solution, shape (k, q), rad or m.
         after: For each of them those after the half-turn, shapes (t, q); empty
             for a single station.
     """
 
     base_from_flange: Floats
+    seen: Flags
     before: Floats
     after: tuple[Floats, ...]
 
@@ -55,11 +58,19 @@ class Candidate:
         joints: Shape (s, q), rad or m: s = 2 before and after a half-turn, else 1.
         base_from_flange: Shape (s, 4, 4), metres.
         normal: Unit normal of the triangle in the world, shape (3,).
+        seen: Which cameras see all markers, nothing between, shape (m,).
     """
 
     joints: Floats
     base_from_flange: Floats
     normal: Floats
+    seen: Flags
+
+    def turned_round(self) -> Candidate:
+        """The same driven the other way."""
+        return Candidate(
+            self.joints[::-1], self.base_from_flange[::-1], self.normal, self.seen
+        )
 
 
 class CandidateSearch:
@@ -133,12 +144,14 @@ class CandidateSearch:
         view, arm = self._view, self._arm
         poses = view.draw(self._rng, _BATCH)
         self.drawn += len(poses)
+        seen = np.ones((len(poses), len(view.cameras)), dtype=bool)
         for name, check in (("tilt", view.tilt_allowed), ("image", view.in_image)):
-            passed = check(poses)
+            seen &= check(poses)
             if turns:
-                passed &= check(poses @ HALF_TURN)
+                seen &= check(poses @ HALF_TURN)
+            passed = seen.sum(axis=1) >= view.required
             self.rejected[name] += int((~passed).sum())
-            poses = poses[passed]
+            poses, seen = poses[passed], seen[passed]
         if len(poses) == 0:
             return []
         targets = arm.base_from_world.matrix @ poses
@@ -151,11 +164,13 @@ class CandidateSearch:
         joints = [before.joints[k] for k in places]
         if not turns:
             return [
-                Prospect(targets[k][None], q, ())
+                Prospect(targets[k][None], seen[k], q, ())
                 for k, q in zip(places, joints, strict=True)
             ]
         possible = [
-            Prospect(np.stack([targets[k], targets[k] @ HALF_TURN]), q, tuple(after))
+            Prospect(
+                np.stack([targets[k], targets[k] @ HALF_TURN]), seen[k], q, tuple(after)
+            )
             for k, q, after in zip(places, joints, self._turned(joints), strict=True)
             if any(len(ends) for ends in after)
         ]
@@ -205,10 +220,10 @@ class CandidateSearch:
         reasons: list[str] = []
         for k in order[:_SOLUTIONS]:
             for joints in _joints(prospect, k):
-                reason = self._obstacle(joints)
+                seen, reason = self._judged(joints, prospect.seen)
                 if reason is None:
                     self._anchor = joints[-1]
-                    return self._candidate(prospect, joints)
+                    return self._candidate(prospect, joints, seen)
                 reasons.append(reason)
                 if reason == _BY_RIG:
                     # The rig hides its own marker: so it does in every solution.
@@ -221,31 +236,43 @@ class CandidateSearch:
 
     def all_free(self, prospect: Prospect) -> list[Candidate]:
         """Every solution that no solid forbids."""
-        return [
-            self._candidate(prospect, joints)
-            for k in range(len(prospect.before))
-            for joints in _joints(prospect, k)
-            if self._obstacle(joints) is None
-        ]
+        found = []
+        for k in range(len(prospect.before)):
+            for joints in _joints(prospect, k):
+                seen, reason = self._judged(joints, prospect.seen)
+                if reason is None:
+                    found.append(self._candidate(prospect, joints, seen))
+        return found
 
-    def _candidate(self, prospect: Prospect, joints: Floats) -> Candidate:
+    def _candidate(self, prospect: Prospect, joints: Floats, seen: Flags) -> Candidate:
         world = self._arm.base_from_world.inverse().matrix
         normal = self._view.normals(world @ prospect.base_from_flange[:1])[0]
-        return Candidate(joints, self._arm.forward(joints), normal)
+        return Candidate(joints, self._arm.forward(joints), normal, seen)
 
-    def _obstacle(self, joints: Floats) -> str | None:
-        """Name of the check that a candidate's joints (s, q) fail, or None."""
+    def _judged(self, joints: Floats, seen: Flags) -> tuple[Flags, str | None]:
+        """Cameras left with a free sight, and the check that joints (s, q) fail."""
         arm, view = self._arm, self._view
-        for q in joints:
-            for camera in view.world_from_camera[:, :3, 3]:
-                for marker, radius in enumerate(SIGHT_MARGIN * view.radii):
-                    blocker = arm.sight_blocked(q, camera, marker, radius)
-                    if blocker is not None:
-                        return _BY_RIG if blocker in arm.on_flange else "occlusion"
+        free, reason = seen.copy(), "occlusion"
+        for i in np.flatnonzero(seen):
+            blocker = self._blocker(joints, view.world_from_camera[i, :3, 3])
+            if blocker is not None:
+                free[i] = False
+                reason = _BY_RIG if blocker in arm.on_flange else "occlusion"
+            if free.sum() < view.required:
+                return free, reason
         if any(arm.collision(q) is not None for q in joints):
-            return "collision"
+            return free, "collision"
         if len(joints) == 2 and arm.path_collision(*joints) is not None:
-            return "turn_path"
+            return free, "turn_path"
+        return free, None
+
+    def _blocker(self, joints: Floats, camera: Floats) -> str | None:
+        """Name of a solid that hides a marker from a camera, or None."""
+        for q in joints:
+            for marker, radius in enumerate(SIGHT_MARGIN * self._view.radii):
+                blocker = self._arm.sight_blocked(q, camera, marker, radius)
+                if blocker is not None:
+                    return blocker
         return None
 
 

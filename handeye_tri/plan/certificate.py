@@ -54,6 +54,7 @@ def certify(
     cell: Cell,
     model: StationInformation,
     base_from_flange: Floats,
+    seen: NDArray[np.bool_],
     turns: NDArray[np.intp],
 ) -> Certificate:
     """Predict a calibration from its stations.
@@ -79,9 +80,10 @@ def certify(
         cell: The cell.
         model: Predicts what stations tell.
         base_from_flange: Calibration stations, shape (n, 4, 4), metres.
+        seen: Which cameras see all markers there, shape (n, m).
         turns: Stations before and after each half-turn, shape (k, 2).
     """
-    information = model.of_stations(base_from_flange).sum(axis=0)
+    information = model.of_stations(base_from_flange, seen).sum(axis=0)
     values, vectors = _scaled_spectrum(information)
     covariance = model.covariance(information)
     normals = model.view.normals(
@@ -117,6 +119,7 @@ def certify(
     )
     undetermined = _undetermined(covariance.labels, values, vectors)
     findings = _findings(cell, numbers, undetermined, len(turns))
+    findings += _apart(cell, seen)
     if findings:
         findings.append(_addition(cell, model, information))
     cannot = bool(undetermined) or numbers["axis_spread"] < MIN_AXIS_SPREAD
@@ -183,18 +186,37 @@ def _findings(
     return found
 
 
+def _apart(cell: Cell, seen: NDArray[np.bool_]) -> list[str]:
+    """Cameras that share no station with the first, nor through others."""
+    together = seen.T.astype(int) @ seen > 0
+    reached = np.zeros(len(cell.cameras), dtype=bool)
+    reached[0] = True
+    for _ in cell.cameras:
+        reached |= together[reached].any(axis=0)
+    if reached.all():
+        return []
+    names = [c.name for c, near in zip(cell.cameras, reached, strict=True) if not near]
+    return [
+        f"no chain of common views joins {cell.cameras[0].name} with "
+        f"{', '.join(names)}: only the robot ties them together"
+    ]
+
+
 def _addition(cell: Cell, model: StationInformation, information: Floats) -> str:
     """Which half-turn helps most, in words; looks at cameras, not at the arm."""
     view = model.view
     world = view.draw(np.random.default_rng(0), _DRAWN)
-    for check in (view.tilt_allowed, view.in_image):
-        world = world[check(world) & check(world @ HALF_TURN)]
+    seen = view.seen(world) & view.seen(world @ HALF_TURN)
+    enough = seen.sum(axis=1) >= view.required
+    world, seen = world[enough], seen[enough]
     if len(world) == 0:
         return "Do: turn the cameras to the workspace box; no half-turn there is seen"
     base = model.base_from_world @ world
     poses = np.stack([base, base @ HALF_TURN], axis=1)
     design = Design(
-        model.of_half_turns(poses), model.prior + information, model.workspace_cost
+        model.of_half_turns(poses, seen),
+        model.prior + information,
+        model.workspace_cost,
     )
     costs = [design.cost(row) for row in np.eye(len(world))]
     best = int(np.argmin(costs))

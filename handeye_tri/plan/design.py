@@ -65,6 +65,7 @@ class Design:
         scale = 1.0 / np.sqrt(np.diag(total))
         root = np.linalg.cholesky(total * scale[:, None] * scale)
         to = scale[:, None] * np.linalg.inv(root).T
+        self._to = to
         self._information = to.T @ information @ to
         self._prior = to.T @ prior @ to
         self._cost = to.T @ cost @ to
@@ -72,6 +73,15 @@ class Design:
 
     def __len__(self) -> int:
         return len(self._information)
+
+    def change(self, candidate: int, information: Floats) -> None:
+        """Correct what one candidate tells.
+
+        Args:
+            candidate: Its index.
+            information: Shape (p, p).
+        """
+        self._information[candidate] = self._to.T @ information @ self._to
 
     def cost(self, weights: Floats) -> float:
         """Cost of a design, shape (n,) of fractions or zeros and ones."""

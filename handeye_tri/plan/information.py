@@ -20,6 +20,7 @@ from handeye_tri.records import Covariance, Repeatability, motion_labels
 from handeye_tri.se3 import hat, se3_inverse
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 # Detection's standard deviation per axis that predictions assume, pixels.
 EXPECTED_SIGMA_PX = 0.03
@@ -90,11 +91,14 @@ class StationInformation:
         self.labels = tuple(labels)
         self.prior = np.diag(1.0 / np.square(prior))
 
-    def _derivatives(self, base_from_flange: Floats) -> tuple[Floats, Floats, Floats]:
+    def _derivatives(
+        self, base_from_flange: Floats, seen: Flags
+    ) -> tuple[Floats, Floats, Floats]:
         """Pixels by unknowns, by the station's error, and by the points in base.
 
         Args:
             base_from_flange: Shape (n, 4, 4), metres.
+            seen: Which cameras count, shape (n, m); all is zero for the others.
 
         Returns:
             Shapes (n, m, 3, 2, p), (n, m, 3, 2, 6), (n, m, 3, 2, 3).
@@ -110,6 +114,7 @@ class StationInformation:
             rotation = camera_from_flange[:, None, :3, :3]
             points = (rotation @ view.markers[..., None])[..., 0]
             points += camera_from_flange[:, None, :3, 3]
+            points = np.where(seen[:, i, None, None], points, (0.0, 0.0, 1.0))
             _, by_point, by_intrinsics, by_lens = camera.project_jacobians(points)
             columns, chosen, lens = self._columns[i]
             by_camera = np.concatenate([-by_point, by_point @ hat(points)], axis=-1)
@@ -125,11 +130,21 @@ class StationInformation:
                 [by_triangle, -by_triangle @ hat(triangle)], axis=-1
             )
             by_base_point[:, i] = by_point @ self._camera_from_base[i, :3, :3]
+        for result in (by_unknowns, by_error, by_base_point):
+            result[~seen] = 0.0
         return by_unknowns, by_error, by_base_point
 
-    def of_stations(self, base_from_flange: Floats) -> Floats:
-        """Information of each station, shape (n, p, p), of poses (n, 4, 4)."""
-        by_unknowns, by_error, _ = self._derivatives(base_from_flange)
+    def of_stations(self, base_from_flange: Floats, seen: Flags) -> Floats:
+        """Information of each station.
+
+        Args:
+            base_from_flange: Shape (n, 4, 4), metres.
+            seen: Which cameras see all markers there, shape (n, m).
+
+        Returns:
+            Shape (n, p, p).
+        """
+        by_unknowns, by_error, _ = self._derivatives(base_from_flange, seen)
         n, p = len(base_from_flange), len(self.labels)
         rows = by_unknowns.shape[1] * 6
         a = by_unknowns.reshape(n, rows, p)
@@ -138,18 +153,29 @@ class StationInformation:
         noise += self.sigma_px**2 * np.eye(a.shape[1])
         return np.asarray(a.swapaxes(-1, -2) @ np.linalg.solve(noise, a))
 
-    def of_half_turns(self, base_from_flange: Floats) -> Floats:
-        """Information of each half-turn, shape (n, p, p), of poses (n, 2, 4, 4)."""
-        each = self.of_stations(base_from_flange.reshape(-1, 4, 4))
+    def of_half_turns(self, base_from_flange: Floats, seen: Flags) -> Floats:
+        """Information of each half-turn.
+
+        Args:
+            base_from_flange: Shape (n, 2, 4, 4), metres.
+            seen: Which cameras see all markers before and after, shape (n, m).
+
+        Returns:
+            Shape (n, p, p).
+        """
+        each = self.of_stations(
+            base_from_flange.reshape(-1, 4, 4), np.repeat(seen, 2, axis=0)
+        )
         size = len(self.labels)
         return np.asarray(each.reshape(-1, 2, size, size).sum(axis=1))
 
     @cached_property
-    def _places(self) -> Floats:
-        """Flange poses in the workspace box that all cameras see, (n, 4, 4)."""
+    def _places(self) -> tuple[Floats, Flags]:
+        """Flange poses in the workspace box, (n, 4, 4), and who sees them, (n, m)."""
         world = self.view.draw(np.random.default_rng(0), _DRAWN_PLACES)
-        world = world[self.view.tilt_allowed(world) & self.view.in_image(world)]
-        return np.asarray(self.base_from_world @ world[:_PLACES])
+        seen = self.view.seen(world)
+        enough = np.flatnonzero(seen.sum(axis=1) >= self.view.required)[:_PLACES]
+        return np.asarray(self.base_from_world @ world[enough]), seen[enough]
 
     @cached_property
     def workspace_cost(self) -> Floats:
@@ -157,15 +183,15 @@ class StationInformation:
 
         ``trace(workspace_cost @ covariance)`` is the mean squared distance between
         reported and observed markers that the calibration causes, in m^2, over
-        poses in the workspace box that all cameras see.
+        poses in the workspace box that enough cameras see.
         """
-        track = self.track_derivatives(self._places).reshape(-1, len(self.labels))
+        track = self.track_derivatives(*self._places).reshape(-1, len(self.labels))
         return np.asarray(track.T @ track / (len(track) / 3))
 
     @cached_property
     def workspace_noise(self) -> float:
         """Mean squared distance there from a new view's and the robot's noise, m^2."""
-        _, _, by_point = self._derivatives(self._places)
+        _, _, by_point = self._derivatives(*self._places)
         normal = np.einsum("nikac,nikad->nkcd", by_point, by_point)
         seen = self.sigma_px**2 * np.trace(np.linalg.inv(normal), axis1=2, axis2=3)
         lever = np.concatenate(
@@ -190,7 +216,7 @@ class StationInformation:
             gradient[places] = sign * along @ pose[:3, :3]
         return float(np.sqrt(gradient @ covariance.matrix @ gradient))
 
-    def track_derivatives(self, base_from_flange: Floats) -> Floats:
+    def track_derivatives(self, base_from_flange: Floats, seen: Flags) -> Floats:
         """Observed less reported marker positions by the unknowns.
 
         Observed: triangulated from fixed pixels with equal weights. Reported: the
@@ -198,11 +224,12 @@ class StationInformation:
 
         Args:
             base_from_flange: Shape (n, 4, 4), metres.
+            seen: Which cameras place the markers, shape (n, m), two or more each.
 
         Returns:
             Shape (n, 3, 3, p): station, marker, axis in base.
         """
-        by_unknowns, _, by_point = self._derivatives(base_from_flange)
+        by_unknowns, _, by_point = self._derivatives(base_from_flange, seen)
         triangle = self.view.cell.rig.triangle.points
         # The triangle's own columns do not move what the cameras observe.
         by_cameras = by_unknowns.copy()

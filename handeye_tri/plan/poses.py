@@ -20,6 +20,8 @@ _MIN_TILT = np.radians(8.0)
 # from the image plane towards the cameras.
 _LIFT = np.radians([15.0, 50.0])
 _OUTLINE_POINTS = 12
+# A pose is turned to a camera and to those that look from this near its direction.
+_SIDE = np.radians(60.0)
 # A lens model may fold far points back into the image: without its lens, the
 # image extends by at most this part of its size.
 _BEYOND_IMAGE = 0.25
@@ -35,6 +37,7 @@ class View:
         flange_from_triangle: The rig on the flange.
         markers: A, B, C in the flange frame, shape (3, 3), metres.
         radii: Marker radii, shape (3,), metres.
+        required: How many cameras must see a station: two, to place a marker.
     """
 
     def __init__(self, cell: Cell) -> None:
@@ -47,21 +50,21 @@ class View:
         self.flange_from_triangle: SE3 = cell.rig.flange_from_triangle
         self.markers = self.flange_from_triangle.apply(cell.rig.triangle.points)
         self.radii = 1e-3 * np.array(cell.rig.marker_radii_mm)
+        self.required = min(2, len(self.cameras))
 
     def draw(self, rng: np.random.Generator, n: int) -> Floats:
         """Random flange poses that show the rig to the cameras.
 
         The rig's centre is uniform in the workspace box. The triangle is tilted
-        against the mean line of sight, up to the cell's ``max_tilt_deg`` in any
-        direction, and spun about its half-turn axis.
+        against the mean line of sight of cameras on one side, up to the cell's
+        ``max_tilt_deg`` in any direction, and spun about its half-turn axis.
 
         Returns:
             ``world_from_flange``, shape (n, 4, 4), metres.
         """
         plan = self.cell.plan
         centre = rng.uniform(plan.workspace_min_m, plan.workspace_max_m, (n, 3))
-        toward = self.world_from_camera[:, :3, 3].mean(axis=0) - centre
-        sight = _frames_along(toward)
+        sight = _frames_along(self._side(rng, centre) - centre)
         around = rng.uniform(0.0, 2 * np.pi, n)
         most = np.radians(plan.max_tilt_deg)
         if self.cell.rig.axis == "normal":
@@ -90,6 +93,18 @@ class View:
         poses[:, 3, 3] = 1.0
         return poses
 
+    def _side(self, rng: np.random.Generator, centre: Floats) -> Floats:
+        """Mean position of the cameras on one side of each place (n, 3), (n, 3)."""
+        places = self.world_from_camera[:, :3, 3]
+        toward = places - centre[:, None]
+        toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
+        near = np.einsum("nia,nja->nij", toward, toward) > np.cos(_SIDE)
+        if near.all():
+            return np.broadcast_to(places.mean(axis=0), centre.shape)
+        lead = rng.integers(len(places), size=len(centre))
+        weight = near[np.arange(len(centre)), lead].astype(float)
+        return np.asarray(weight @ places / weight.sum(axis=1, keepdims=True))
+
     def marker_positions(self, world_from_flange: Floats) -> Floats:
         """A, B, C in the world, shape (n, 3, 3), metres, of poses (n, 4, 4)."""
         turned = self.markers @ np.swapaxes(world_from_flange[:, :3, :3], -1, -2)
@@ -101,20 +116,22 @@ class View:
         return np.asarray(world_from_flange[:, :3, :3] @ own)
 
     def in_image(self, world_from_flange: Floats) -> Flags:
-        """Whether every camera has every marker's outline inside by the margin.
+        """Which cameras have every marker's outline inside by the margin.
 
         Args:
             world_from_flange: Shape (n, 4, 4), metres.
 
         Returns:
-            Shape (n,).
+            Shape (n, m).
         """
         points = self.marker_positions(world_from_flange)
         margin = self.cell.plan.image_margin_px
-        inside = np.ones(len(points), dtype=bool)
-        for camera, pose in zip(self.cameras, self.world_from_camera, strict=True):
+        inside = np.ones((len(points), len(self.cameras)), dtype=bool)
+        for i, (camera, pose) in enumerate(
+            zip(self.cameras, self.world_from_camera, strict=True)
+        ):
             local = (points - pose[:3, 3]) @ pose[:3, :3]
-            inside &= _outlines_inside(camera, local, self.radii, margin)
+            inside[:, i] = _outlines_inside(camera, local, self.radii, margin)
         return inside
 
     def tilts(self, world_from_flange: Floats) -> Floats:
@@ -137,9 +154,13 @@ class View:
         return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
     def tilt_allowed(self, world_from_flange: Floats) -> Flags:
-        """Whether no camera sees the triangle too steeply, shape (n,)."""
+        """Which cameras do not see the triangle too steeply, shape (n, m)."""
         most = np.radians(self.cell.plan.max_tilt_deg)
-        return np.asarray((self.tilts(world_from_flange) <= most).all(axis=1))
+        return np.asarray(self.tilts(world_from_flange) <= most)
+
+    def seen(self, world_from_flange: Floats) -> Flags:
+        """Which cameras see the rig well, whatever stands between, shape (n, m)."""
+        return self.tilt_allowed(world_from_flange) & self.in_image(world_from_flange)
 
 
 def plane_angles(first: Floats, second: Floats) -> Floats:

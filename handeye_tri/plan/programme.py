@@ -105,11 +105,13 @@ class Visited:
 
     Attributes:
         base_from_flange: Shape (n, 4, 4), metres.
+        seen: Which cameras saw all markers there, shape (n, m).
         turns: Which of them make half-turns, shape (k, 2).
         joints: Where the arm stands now, shape (q,), rad or m.
     """
 
     base_from_flange: Floats
+    seen: NDArray[np.bool_]
     turns: NDArray[np.intp]
     joints: Floats
 
@@ -164,7 +166,10 @@ class _Planner:
         # What more is planned for needs no stations of its own to test it.
         self.held_out = 0 if visited else cell.plan.evaluation_stations
         self.visited = visited or Visited(
-            np.zeros((0, 4, 4)), np.zeros((0, 2), dtype=np.intp), arm.home
+            np.zeros((0, 4, 4)),
+            np.zeros((0, len(cell.cameras)), dtype=bool),
+            np.zeros((0, 2), dtype=np.intp),
+            arm.home,
         )
         self.view = View(cell)
         self.model = StationInformation(
@@ -220,12 +225,22 @@ class _Planner:
 
         without_solids = Counter(self.rejected)
         design = Design(
-            self.model.of_half_turns(np.array([p.base_from_flange for p in pool])),
+            self.model.of_half_turns(
+                np.array([p.base_from_flange for p in pool]),
+                np.array([p.seen for p in pool]),
+            ),
             self.model.prior
-            + self.model.of_stations(self.visited.base_from_flange).sum(axis=0),
+            + self.model.of_stations(
+                self.visited.base_from_flange, self.visited.seen
+            ).sum(axis=0),
             self.model.workspace_cost,
         )
-        selector = Selector(design, pool, search, self.wanted, checked)
+
+        def tells(candidate: Candidate) -> Floats:
+            poses = candidate.base_from_flange[None]
+            return np.asarray(self.model.of_half_turns(poses, candidate.seen[None])[0])
+
+        selector = Selector(design, pool, search, self.wanted, checked, tells)
         if selector.probe() == 0:
             by_solids = self.rejected - without_solids
             raise self._no_plan(
@@ -267,10 +282,10 @@ class _Planner:
         """
         least = np.radians(self.cell.plan.min_plane_spread_deg)
         options = [
-            Candidate(way.joints[::s], way.base_from_flange[::s], way.normal)
+            each
             for some in ways
             for way in some[: _OPTIONS // 2]
-            for s in (1, -1)
+            for each in (way, way.turned_round())
         ]
         stop = np.array(
             [k for k, some in enumerate(ways) for _ in some[: _OPTIONS // 2] * 2]
@@ -338,6 +353,9 @@ class _Planner:
             self.model,
             np.concatenate(
                 [self.visited.base_from_flange, *(c.base_from_flange for c in chosen)]
+            ),
+            np.concatenate(
+                [self.visited.seen, *(np.stack([c.seen, c.seen]) for c in chosen)]
             ),
             np.concatenate([self.visited.turns, added]),
         )

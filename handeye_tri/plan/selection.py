@@ -57,6 +57,7 @@ class Selector:
         search: CandidateSearch,
         wanted: int,
         progress: Callable[[], None],
+        tells: Callable[[Candidate], Floats],
     ) -> None:
         """Start with nothing known.
 
@@ -66,12 +67,15 @@ class Selector:
             search: Checks them and counts why they fail.
             wanted: How many to choose.
             progress: Called after each check.
+            tells: Information of a checked candidate, shape (p, p).
         """
         self._design = design
         self._prospects = prospects
         self._search = search
         self._wanted = wanted
         self._progress = progress
+        self._tells = tells
+        self._changed = 0
         self._found: dict[int, Candidate] = {}
         self.usable = np.ones(len(prospects), dtype=bool)
         self.checked = 0
@@ -97,6 +101,10 @@ class Selector:
             self.usable[index] = False
             return False
         self._found[index] = candidate
+        if (candidate.seen != self._prospects[index].seen).any():
+            # Something hides the rig from a camera, but not from too many.
+            self._changed += 1
+            self._design.change(index, self._tells(candidate))
         if self.checked == _MOST_CHECKS:
             self.usable[:] = False
             self.usable[list(self._found)] = True
@@ -110,9 +118,9 @@ class Selector:
             needed = np.flatnonzero(relaxation.weights > _SUPPORT)
             ahead = self._design.ranked(relaxation.weights, self.usable)
             ahead = ahead[: _RUNNERS_UP * self._wanted]
-            before = int(self.usable.sum())
+            before = int(self.usable.sum()) - self._changed
             blocked = [k for k in {*chosen, *needed} if not self._passes(int(k))]
-            if not blocked and before == int(self.usable.sum()):
+            if not blocked and before == int(self.usable.sum()) - self._changed:
                 return Selection(chosen, relaxation.bound)
             for k in ahead:
                 self._passes(int(k))

@@ -19,6 +19,7 @@ from handeye_tri.records import HalfTurn, Plan, Station
 from handeye_tri.se3 import SE3, se3_inverse, so3_log
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 # Two stations that differ by a half-turn within this are taken for one: a programme
 # that was typed by hand is rounded to a hundredth of a degree or a tenth of a mm.
@@ -60,8 +61,9 @@ def certify_stations(cell: Cell, arm: Arm, joints: ArrayLike) -> Plan:
     view = View(cell)
     base = arm.base_from_world.matrix
     model = StationInformation(view, base, cell.repeatability, EXPECTED_SIGMA_PX)
-    certificate = certify(cell, model, poses, turns)
-    forbidden = _forbidden(arm, view, q, poses)
+    seen = view.seen(arm.base_from_world.inverse().matrix @ poses)
+    forbidden = _forbidden(arm, view, q, seen)
+    certificate = certify(cell, model, poses, seen, turns)
     times = travel_time(
         np.array([arm.home, *q[:-1]]), q, arm.speed, cell.arm.acceleration_time_s
     )
@@ -95,11 +97,14 @@ def _half_turns(poses: Floats) -> NDArray[np.intp]:
     return np.array(found, dtype=np.intp).reshape(-1, 2)
 
 
-def _forbidden(arm: Arm, view: View, joints: Floats, poses: Floats) -> list[str]:
-    """What stands against each station and each move, one sentence each."""
+def _forbidden(arm: Arm, view: View, joints: Floats, seen: Flags) -> list[str]:
+    """What stands against each station and each move, one sentence each.
+
+    Cameras from which something hides a marker are taken out of ``seen``.
+    """
     found = []
-    world = arm.base_from_world.inverse().matrix @ poses
-    steep, outside = ~view.tilt_allowed(world), ~view.in_image(world)
+    world = arm.base_from_world.inverse().matrix @ arm.forward(joints)
+    inside = view.in_image(world).sum(axis=1) >= view.required
     for k, q in enumerate(joints):
         beyond = np.flatnonzero((q < arm.lower) | (q > arm.upper))
         for j in beyond:
@@ -107,17 +112,20 @@ def _forbidden(arm: Arm, view: View, joints: Floats, poses: Floats) -> list[str]
                 f"station {k}: joint {arm.joint_names[j]} at {q[j]:.3f} leaves its "
                 f"limits {arm.lower[j]:.3f} to {arm.upper[j]:.3f} (rad or m)"
             )
-        if outside[k]:
-            found.append(f"station {k}: a marker leaves the image of a camera")
-        if steep[k]:
+        if not inside[k]:
             found.append(
-                f"station {k}: a camera sees the triangle steeper than "
-                f"{view.cell.plan.max_tilt_deg:.0f} degrees"
+                f"station {k}: fewer than {view.required} cameras have all markers in "
+                "their image"
+            )
+        elif seen[k].sum() < view.required:
+            found.append(
+                f"station {k}: fewer than {view.required} cameras see the triangle at "
+                f"less than {view.cell.plan.max_tilt_deg:.0f} degrees"
             )
         hit = arm.collision(q)
         if hit is not None:
             found.append(f"station {k}: {hit[0]} touches {hit[1]}")
-        found += _hidden(arm, view, k, q)
+        found += _hidden(arm, view, k, q, seen[k])
     for k, (start, end) in enumerate(pairwise(joints)):
         hit = arm.path_collision(start, end)
         if hit is not None and arm.collision(start) is None is arm.collision(end):
@@ -125,16 +133,16 @@ def _forbidden(arm: Arm, view: View, joints: Floats, poses: Floats) -> list[str]
     return found
 
 
-def _hidden(arm: Arm, view: View, station: int, q: Floats) -> list[str]:
+def _hidden(arm: Arm, view: View, station: int, q: Floats, seen: Flags) -> list[str]:
     found = []
-    for config, place in zip(
-        view.cell.cameras, view.world_from_camera[:, :3, 3], strict=True
-    ):
+    for i in np.flatnonzero(seen):
+        place = view.world_from_camera[i, :3, 3]
         for marker, radius in enumerate(SIGHT_MARGIN * view.radii):
             blocker = arm.sight_blocked(q, place, marker, radius)
             if blocker is not None:
+                seen[i] = False
                 found.append(
                     f"station {station}: {blocker} hides marker {'ABC'[marker]} from "
-                    f"camera {config.name}"
+                    f"camera {view.cell.cameras[i].name}"
                 )
-    return found
+    return found if seen.sum() < view.required else []

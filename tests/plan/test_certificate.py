@@ -19,6 +19,10 @@ def model_of(name="hp3_stereo", sigma_px=0.03):
     return StationInformation(View(cell), base, cell.repeatability, sigma_px)
 
 
+def both(poses):
+    return np.ones((len(poses), 2), dtype=bool)
+
+
 def planned(name="hp3_stereo"):
     plan = scene.plan_of(name)
     poses = np.array([s.base_from_flange.matrix for s in plan.stations[:22]])
@@ -27,7 +31,9 @@ def planned(name="hp3_stereo"):
 
 def test_a_good_plan_passes_without_findings():
     poses, turns = planned()
-    certificate = certify(scene.cell_of("hp3_stereo"), model_of(), poses, turns)
+    certificate = certify(
+        scene.cell_of("hp3_stereo"), model_of(), poses, both(poses), turns
+    )
     assert certificate.outcome == "PASS"
     assert certificate.findings == ()
     numbers = certificate.numbers
@@ -42,7 +48,11 @@ def test_stations_that_only_shift_leave_most_unknown():
     shifts[:, :3] = np.random.default_rng(0).normal(size=(6, 3)) * 0.02
     poses = pose @ se3_exp(shifts)
     certificate = certify(
-        scene.cell_of("hp3_stereo"), model_of(), poses, np.zeros((0, 2), dtype=int)
+        scene.cell_of("hp3_stereo"),
+        model_of(),
+        poses,
+        both(poses),
+        np.zeros((0, 2), dtype=int),
     )
     assert certificate.outcome == "CANNOT TELL"
     text = " ".join(certificate.findings)
@@ -58,7 +68,11 @@ def test_two_half_turns_in_parallel_planes_are_named():
     moved = pose @ se3_exp(np.array([0.03, 0.02, 0.04, 0, 0, 0.4]))
     poses = np.array([pose, pose @ HALF_TURN, moved, moved @ HALF_TURN])
     certificate = certify(
-        scene.cell_of("hp3_stereo"), model_of(), poses, np.array([[0, 1], [2, 3]])
+        scene.cell_of("hp3_stereo"),
+        model_of(),
+        poses,
+        both(poses),
+        np.array([[0, 1], [2, 3]]),
     )
     assert certificate.outcome == "CANNOT TELL"
     assert "0.0 degrees apart, needs 20" in " ".join(certificate.findings)
@@ -67,7 +81,7 @@ def test_two_half_turns_in_parallel_planes_are_named():
 def test_a_tight_limit_fails_and_says_by_how_much():
     poses, turns = planned()
     cell = scene.changed("hp3_stereo", track_limit_mm=0.05)
-    certificate = certify(cell, model_of(), poses, turns)
+    certificate = certify(cell, model_of(), poses, both(poses), turns)
     assert certificate.outcome == "FAIL"
     assert "limit 0.05 mm" in certificate.findings[0]
 
@@ -75,7 +89,7 @@ def test_a_tight_limit_fails_and_says_by_how_much():
 def test_the_half_turn_that_is_proposed_helps_as_promised():
     poses, turns = planned()
     cell = scene.changed("hp3_stereo", track_limit_mm=0.05)
-    few = certify(cell, model_of(), poses[:8], turns[:4])
+    few = certify(cell, model_of(), poses[:8], both(poses[:8]), turns[:4])
     promised = float(few.findings[-1].split("error is ")[1].split(" mm")[0])
     assert promised < few.numbers["track_calibration_rms_mm"]
 
@@ -88,7 +102,7 @@ def test_predicted_track_error_is_that_of_a_simulated_test():
     cell, model = scene.cell_of("hp3_stereo"), model_of()
     view, rng = View(cell), np.random.default_rng(4)
     world = view.draw(rng, 4000)
-    world = world[view.tilt_allowed(world) & view.in_image(world)]
+    world = world[view.seen(world).all(axis=1)]
     base = model.base_from_world @ world
     n = len(base)
     sigma = np.repeat([cell.repeatability.translation, cell.repeatability.rotation], 3)
@@ -112,7 +126,7 @@ def test_predicted_track_error_is_that_of_a_simulated_test():
 def test_baseline_sigma_is_that_of_drawn_cameras():
     model = model_of()
     poses, _ = planned()
-    covariance = model.covariance(model.of_stations(poses).sum(axis=0))
+    covariance = model.covariance(model.of_stations(poses, both(poses)).sum(axis=0))
     rng = np.random.default_rng(0)
     drawn = rng.multivariate_normal(
         np.zeros(len(model.labels)), covariance.matrix, 4000
@@ -137,3 +151,24 @@ def test_axis_spread_of_known_rotations():
     assert axis_spread(turns) == pytest.approx(0, abs=1e-7)
     assert axis_spread(np.array([np.eye(3)] * 3)) == 0.0
     assert axis_spread(so3_exp(np.random.default_rng(0).normal(size=(40, 3)))) > 0.5
+
+
+def test_cameras_without_a_common_view_are_named():
+    poses, turns = planned()
+    seen = both(poses)
+    seen[::4, 0] = seen[1::4, 0] = False
+    seen[2::4, 1] = seen[3::4, 1] = False
+    assert not seen.all(axis=1).any()
+    certificate = certify(scene.cell_of("hp3_stereo"), model_of(), poses, seen, turns)
+    assert certificate.outcome == "FAIL"
+    assert "no chain of common views joins left with right" in certificate.findings[0]
+
+
+def test_what_a_camera_does_not_see_tells_nothing_of_it():
+    poses, _ = planned()
+    model, seen = model_of(), both(poses)
+    seen[:, 1] = False
+    information = model.of_stations(poses, seen).sum(axis=0)
+    other = [k for k, name in enumerate(model.labels) if "right" in name]
+    assert np.abs(information[other]).max() == 0
+    assert np.abs(information).max() > 0

@@ -29,8 +29,9 @@ class Predicted:
             self.view, self.base_from_world, cell.repeatability, SIGMA
         )
         poses = self.view.draw(np.random.default_rng(5), 60)
-        poses = poses[self.view.in_image(poses)][:12]
+        poses = poses[self.view.in_image(poses).all(axis=1)][:12]
         self.poses = self.base_from_world @ poses
+        self.seen = np.ones((len(poses), len(self.view.cameras)), dtype=bool)
 
     def deviated(self, delta):
         """Cameras, base_from_camera and flange_from_triangle, off by delta (p,)."""
@@ -108,7 +109,7 @@ def test_information_is_that_of_the_whole_least_squares_problem(cell):
         expected[j] = normal[:p, :p] - coupling @ np.linalg.solve(
             normal[p:, p:], coupling.T
         )
-    found = scenario.model.of_stations(scenario.poses)
+    found = scenario.model.of_stations(scenario.poses, scenario.seen)
     # Both sides in units where every diagonal is 1: differences cost 1e-7 relative.
     scale = 1 / np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
     unit = scale[:, :, None] * scale[:, None, :]
@@ -122,9 +123,9 @@ def test_an_exact_robot_is_the_limit_of_a_good_one(cell):
         scenario.base_from_world,
         type(cell.repeatability)(0.0, 0.0),
         SIGMA,
-    ).of_stations(scenario.poses)
+    ).of_stations(scenario.poses, scenario.seen)
     # Information only grows as the robot gets better.
-    gained = exact - scenario.model.of_stations(scenario.poses)
+    gained = exact - scenario.model.of_stations(scenario.poses, scenario.seen)
     scale = 1 / np.sqrt(np.diagonal(exact, axis1=1, axis2=2))
     eigenvalues = np.linalg.eigvalsh(gained * scale[:, :, None] * scale[:, None, :])
     assert eigenvalues.min() > -1e-9
@@ -145,7 +146,7 @@ def test_track_derivatives_meet_triangulation(cell):
         )
         return observed.reshape(n, 3, 3) - scenario.markers(rig)
 
-    found = scenario.model.track_derivatives(scenario.poses)
+    found = scenario.model.track_derivatives(scenario.poses, scenario.seen)
     # A step of 1e-4 keeps differences of points near 1 m at 1e-11, the truncation
     # at 1e-8 of derivatives up to 10.
     expected = numeric(track, p, step=1e-4)
@@ -154,7 +155,7 @@ def test_track_derivatives_meet_triangulation(cell):
 
 def test_covariance_is_the_inverse_and_names_what_is_estimated(cell):
     scenario = Predicted(cell)
-    information = scenario.model.of_stations(scenario.poses).sum(axis=0)
+    information = scenario.model.of_stations(scenario.poses, scenario.seen).sum(axis=0)
     covariance = scenario.model.covariance(information)
     product = covariance.matrix @ (information + scenario.model.prior)
     np.testing.assert_allclose(product, np.eye(len(product)), atol=1e-5)

@@ -164,7 +164,9 @@ def test_the_chosen_half_turns_tell_more_than_random_ones():
         view, arm.base_from_world.matrix, cell.repeatability, sigma
     )
     poses = np.concatenate([c.base_from_flange for c in first])
-    random = model.covariance(model.of_stations(poses).sum(axis=0))
+    random = model.covariance(
+        model.of_stations(poses, np.ones((22, 2), bool)).sum(axis=0)
+    )
     assert plan.certificate["sigma.left.fx_px"] < 0.8 * random.std("left.fx")
 
 
@@ -301,6 +303,7 @@ def test_what_is_planned_next_adds_most_to_what_was_seen():
     seen = plan.stations[:6]
     visited = Visited(
         np.array([s.base_from_flange.matrix for s in seen]),
+        np.ones((6, 2), dtype=bool),
         np.arange(6).reshape(-1, 2),
         seen[-1].joints,
     )
@@ -311,7 +314,8 @@ def test_what_is_planned_next_adds_most_to_what_was_seen():
         View(cell), arm.base_from_world.matrix, cell.repeatability, 0.03
     )
     five = np.array([s.base_from_flange.matrix for s in plan.stations[:10]])
-    usual = certify(cell, model, five, np.arange(10).reshape(-1, 2)).numbers
+    both, turns = np.ones((10, 2), dtype=bool), np.arange(10).reshape(-1, 2)
+    usual = certify(cell, model, five, both, turns).numbers
     name = "track_calibration_rms_mm"
     assert more.certificate[name] < usual[name]
     assert more.certificate[name] > scene.plan_of("hp3_stereo").certificate[name]
@@ -324,6 +328,37 @@ def test_what_is_planned_next_adds_most_to_what_was_seen():
 
 def test_no_half_turn_more_is_refused():
     cell, arm = scene.cell_of("hp3_stereo"), scene.arm_of("hp3_stereo")
-    visited = Visited(np.eye(4)[None], np.zeros((0, 2), dtype=int), arm.home)
+    visited = Visited(
+        np.eye(4)[None], np.ones((1, 2), bool), np.zeros((0, 2), dtype=int), arm.home
+    )
     with pytest.raises(InputError, match="half_turns must be at least 1, got 0"):
         plan_next(cell, arm, visited, 1, 0)
+
+
+def ring(count):
+    """Cameras on an arc about the workspace, copies of the left one."""
+    data = scene.cell_of("hp3_stereo").model_dump(by_alias=True)["cameras"][0]
+    cameras = []
+    for k, angle in enumerate(np.radians(np.linspace(-75, 75, count))):
+        place = (0.45 + 0.9 * np.cos(angle), 0.9 * np.sin(angle), 0.45)
+        cameras.append({**data, "name": f"c{k}", "position_m": place})
+    return scene.changed("hp3_stereo", cameras=cameras)
+
+
+def test_many_cameras_round_the_arm_are_all_determined_and_joined():
+    """No station is seen by all of seven cameras, yet each is tied to each."""
+    cell = ring(7)
+    arm = Arm(scene.compiled(cell))
+    plan = plan_motions(cell, arm, 1)
+    assert plan.outcome == "PASS", plan.findings
+    assert plan.certificate["rank"] == plan.certificate["unknowns"]
+    view = View(cell)
+    world = arm.base_from_world.inverse().matrix @ np.array(
+        [s.base_from_flange.matrix for s in plan.stations]
+    )
+    seen = view.seen(world)
+    assert (seen.sum(axis=1) >= 2).all()
+    assert not seen.all(axis=1).any()
+    assert (seen[:22].sum(axis=0) >= 4).all()
+    for camera in cell.cameras:
+        assert plan.certificate[f"sigma.{camera.name}.fx_px"] < 10
