@@ -13,15 +13,17 @@ from handeye_tri.storage import read_pose_pairs
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 TEXT = (SCRIPTS / "README.md").read_text()
-PAIRS, STREAMS = re.findall(r"```json\n(.*?)```", TEXT, re.DOTALL)
+PAIRS, STREAMS = re.findall(r"```json\n(.*?)```", TEXT, re.DOTALL)[:2]
 SHOWN = re.search(r"```text\n(.*?)```", TEXT, re.DOTALL).group(1)
-KEYS, OF_A_POSE = (
-    re.findall(r"^\| (`.*?) \| (.*) \|$", part, re.MULTILINE)
-    for part in (
-        TEXT[TEXT.index("| key | value |") : TEXT.index("A pose has")],
-        TEXT[TEXT.index("| key of a pose |") :],
-    )
-)
+
+
+def table(head):
+    """Rows of a table: the cell of the key, and what is said of it."""
+    text = TEXT[TEXT.index(head) :].split("\n\n")[0]
+    return re.findall(r"^\| (`.*?) \| (.*) \|$", text, re.MULTILINE)
+
+
+KEYS, OF_A_POSE = table("| key | value |"), table("| key of a pose | value |")
 
 
 def words(text):
