@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -17,24 +16,18 @@ from handeye_tri.calibrate_cameras.closed_form import (
 from handeye_tri.calibrate_cameras.degeneracy import (
     check_axis_ends,
     check_count,
-    check_determined,
     check_planes,
     check_turns,
-    invert_information,
-    least_noise,
     plane_spread_deg,
-    weaknesses,
 )
 from handeye_tri.calibrate_cameras.half_turns import HalfTurnData, read_half_turns
 from handeye_tri.calibrate_cameras.homography import (
-    Homographies,
     fit_homographies,
 )
 from handeye_tri.calibrate_cameras.intrinsic_choice import (
     IntrinsicChoice,
     split_fixed,
 )
-from handeye_tri.calibrate_cameras.least_squares import NormalEquations
 from handeye_tri.calibrate_cameras.lens_selection import lens_advice
 from handeye_tri.calibrate_cameras.lens_verdict import judge_lens
 from handeye_tri.calibrate_cameras.options import (
@@ -45,14 +38,16 @@ from handeye_tri.calibrate_cameras.options import (
 from handeye_tri.calibrate_cameras.outlier_reasons import drop_outliers
 from handeye_tri.calibrate_cameras.refine import (
     HalfTurnModel,
-    State,
-    refine_from_starts,
 )
 from handeye_tri.calibrate_cameras.robust_loss import LOSSES, Loss
+from handeye_tri.calibrate_cameras.single_camera_outcome import (
+    Outcome,
+    at_closed_form,
+    refined,
+)
 from handeye_tri.calibrate_cameras.special_motion import diagonals_meet
 from handeye_tri.calibrate_cameras.starts import (
     blank_state,
-    pinhole_state,
     refinement_starts,
 )
 from handeye_tri.camera import (
@@ -238,11 +233,11 @@ def calibrate_camera(
             raise
     zero = blank_state(model, coefficients, homographies)
     if first is not None and not refine:
-        outcome = _stop_at_closed_form(model, zero, first, homographies, noise_known)
+        outcome = at_closed_form(model, zero, first, homographies, noise_known)
     else:
         starts = refinement_starts(model, zero, first, homographies)
         try:
-            outcome = _refined(model, starts, noise_known)
+            outcome = refined(model, starts, noise_known)
         except (DegenerateMotionError, ConvergenceError) as error:
             advice = None
             if len(lens) > 1:
@@ -292,123 +287,8 @@ def calibrate_camera(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Outcome:
-    state: State
-    covariance: Floats
-    chi2: float
-    condition: float
-    cost_start: float
-    start: str
-    iterations: int
-    weaknesses: tuple[str, ...]
-
-
-def _stop_at_closed_form(
-    model: HalfTurnModel,
-    zero: State,
-    first: ClosedForm,
-    homographies: Homographies,
-    noise_known: bool,
-) -> _Outcome:
-    state = pinhole_state(model, zero, first.k, first.poses)
-    blocks = model.evaluate(state)
-    if blocks is None:
-        raise DegenerateMotionError(
-            "the closed form puts a marker behind the camera "
-            f"(fx {first.k[0, 0]:.1f} px, fy {first.k[1, 1]:.1f} px): the views are "
-            "too weak for it; use refine=True, or planes 20 degrees or more apart"
-        )
-    noise = homographies.chi2 / homographies.dof
-    chosen = model.choice.basis
-    covariance = chosen.T @ first.covariance @ chosen
-    _, condition = invert_information(NormalEquations.of(blocks).reduced())
-    sigma = _focal_sigma(model, covariance, least_noise(noise, noise_known))
-    normals = state.poses[:, :3, 2]
-    focal = state.intrinsics[:2]
-    check_determined(
-        condition,
-        focal,
-        sigma,
-        plane_spread_deg(normals),
-        model.data,
-        len(model.lens),
-    )
-    return _Outcome(
-        state,
-        covariance * (1.0 if noise_known else noise),
-        blocks.cost,
-        condition,
-        blocks.cost,
-        "closed form",
-        0,
-        weaknesses(model.data, normals, focal, sigma, condition),
-    )
-
-
-def _refined(
-    model: HalfTurnModel, starts: dict[str, State], noise_known: bool
-) -> _Outcome:
-    found = refine_from_starts(model, list(starts.values()))
-    if found is None:
-        raise DegenerateMotionError(
-            "no start has all markers in front of the camera: before and after do not "
-            "show half-turns of this triangle; check axis, triangle and marker order"
-        )
-    end, chosen = found
-    state = end.state
-    if model.lens:
-        # With the lens there is no more excuse than without one.
-        missed = model.data.pixels - model.predict(state)
-        check_turns(model.data, np.sqrt((missed**2).mean(axis=(1, 2, 3))))
-    equations = NormalEquations.of(end.blocks)
-    covariance, condition = invert_information(equations.reduced())
-    count = model.camera_unknowns
-    covariance = covariance[:count, :count]
-    noise = end.cost / model.dof
-    normals, focal = state.poses[:, :3, 2], state.intrinsics[:2]
-    sigma = _focal_sigma(model, covariance, least_noise(noise, noise_known))
-    check_determined(
-        condition,
-        focal,
-        sigma,
-        plane_spread_deg(normals),
-        model.data,
-        len(model.lens),
-    )
-    if not end.converged:
-        raise ConvergenceError(
-            f"the refinement did not settle in {end.iterations} iterations (chi2 "
-            f"{end.cost_start:.4g} to {end.cost:.4g} for {model.dof} degrees of "
-            "freedom); check the triangle's sides and the axis, add half-turns, or "
-            "estimate fewer lens coefficients"
-        )
-    closed = starts.get("closed form")
-    closed_cost = None if closed is None else model.evaluate(closed)
-    return _Outcome(
-        state,
-        covariance * (1.0 if noise_known else noise),
-        end.cost,
-        condition,
-        end.cost_start if closed_cost is None else closed_cost.cost,
-        list(starts)[chosen],
-        end.iterations,
-        weaknesses(model.data, normals, focal, sigma, condition),
-    )
-
-
-def _focal_sigma(model: HalfTurnModel, covariance: Floats, noise: float) -> Floats:
-    """Standard deviations of fx and fy, 0 where known, shape (2,), pixels."""
-    by_free = model.choice.basis[:2]
-    of_free = covariance[: by_free.shape[1], : by_free.shape[1]]
-    if not np.isfinite(of_free).all():
-        return np.full(2, np.inf)
-    variance = np.einsum("ik,kl,il->i", by_free, of_free, by_free)
-    return np.asarray(np.sqrt(noise * variance))
-
-
 def _details(
-    model: HalfTurnModel, outcome: _Outcome, n: int, used: NDArray[np.intp]
+    model: HalfTurnModel, outcome: Outcome, n: int, used: NDArray[np.intp]
 ) -> dict[str, Any]:
     def whole(values: Floats) -> Floats:
         """Rows of all n half-turns, NaN for those left out; locked."""
