@@ -200,6 +200,7 @@ def minimise(
     max_iterations: int = 100,
     tolerance: float = RELATIVE_TOLERANCE,
     damping: float = _START_DAMPING,
+    foresee: bool = False,
 ) -> Minimum[State, Rows] | None:
     """Levenberg-Marquardt with Nielsen's damping rule (IMM-REP-1999-05).
 
@@ -213,6 +214,8 @@ def minimise(
         max_iterations: Upper limit of evaluations.
         tolerance: Predicted gain over cost per degree of freedom of a last step.
         damping: Of the first step.
+        foresee: Apply ``tolerance`` to the step after the last one, which gains less
+            by at least the factor by which the last gains less than the one before.
 
     Returns:
         The minimum; None where the start cannot be evaluated.
@@ -228,6 +231,7 @@ def minimise(
             max_iterations,
             tolerance,
             damping,
+            foresee,
         )
 
 
@@ -246,6 +250,7 @@ def _minimise(
     max_iterations: int,
     tolerance: float,
     damping: float,
+    foresee: bool,
 ) -> Minimum[State, Rows] | None:
     blocks = evaluate(start)
     if blocks is None:
@@ -258,6 +263,7 @@ def _minimise(
     equations = blocks.equations()
     converged = False
     iteration = 0
+    before = 0.0
     while iteration < max_iterations and damping < _MAX_DAMPING:
         iteration += 1
         try:
@@ -265,7 +271,10 @@ def _minimise(
         except np.linalg.LinAlgError:
             damping, growth = damping * growth, 2 * growth
             continue
-        negligible = gain <= max(tolerance * cost / freedom, floor)
+        last = gain
+        if foresee and 0.0 < gain < before and damping < _START_DAMPING:
+            last = gain * (gain / before)
+        negligible = last <= max(tolerance * cost / freedom, floor)
         if (
             known is not None
             and gain < 0.1 * known
@@ -277,12 +286,12 @@ def _minimise(
         tried_cost = np.inf if tried is None else tried.cost
         if tried is not None and tried_cost <= cost:
             ratio = (cost - tried_cost) / gain if gain > 0 else 1.0
-            state, blocks, cost = candidate, tried, tried_cost
+            state, blocks, cost, before = candidate, tried, tried_cost, gain
             damping *= max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
             growth = 2.0
             equations = blocks.equations()
         else:
-            damping, growth = damping * growth, 2 * growth
+            damping, growth, before = damping * growth, 2 * growth, 0.0
         # A strongly damped step is short for that reason alone.
         if negligible and damping < 1.0:
             converged = True

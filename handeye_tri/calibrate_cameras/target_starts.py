@@ -87,15 +87,26 @@ def _closed_forms(
     model: TargetModel, image_sizes: list[tuple[int, int]], names: list[str]
 ) -> TargetState:
     """Each camera from its own views, then the places from the views they share."""
-    m, _, n, _ = model.pixels.shape
-    rotation = np.full((m, n, 3, 3), np.nan)
-    translation = np.full((m, n, 3), np.nan)
-    intrinsics, usable = np.empty((m, 5)), np.asarray(model.seen.any(axis=2))
+    m = len(model.pixels)
+    images = [ImageScale.of(size) for size in image_sizes]
+    usable = np.asarray(model.seen.any(axis=2))
+    homographies = _homographies(model, images, model.pixels)
     lens = np.zeros(8 if max(model.lens, default=0) > 4 else 5)
-    for i in range(m):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        if not usable.all():
+            unseen = np.diag([1.0, 1.0, 1.0])[:, :, None, None]
+            homographies = np.where(usable.T, homographies, unseen)
+        unit = intrinsics_from_homographies(
+            homographies, usable.T.astype(float), 2 in model.intrinsics
+        )
+        good = usable_intrinsics(unit)
+        unit = np.where(good, unit, 1.0)
+        rotation, translation = _metric(model, unit, homographies)
+    intrinsics = unit.T * np.array([image.scale for image in images])[:, None]
+    intrinsics[:, 3:] += np.array([image.centre for image in images])
+    for i in np.flatnonzero(~good).tolist():
         views = np.flatnonzero(usable[i])
-        mine = model if m == 1 and len(views) == n else model.take([i], views)
-        found = _one_camera(mine, image_sizes[i], lens)
+        found = _best_guess(model.take([i], views), images[i], lens)
         if found is None:
             raise DegenerateMotionError(
                 f"no camera fits the views of {names[i]!r}: in each start a point is "
@@ -106,31 +117,19 @@ def _closed_forms(
     return _placed(intrinsics, (lens,) * m, rotation, translation, usable)
 
 
-def _one_camera(
-    model: TargetModel, image_size: tuple[int, int], lens: Floats
+def _best_guess(
+    model: TargetModel, image: ImageScale, lens: Floats
 ) -> TargetState | None:
-    """A camera and its views' poses in closed form, or the best of some guesses."""
-    image = ImageScale.of(image_size)
-    homographies = _homographies(model, image, model.pixels[0])
-    weight = np.ones(homographies.shape[2:])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        unit = intrinsics_from_homographies(
-            homographies, weight, 2 in model.intrinsics
-        )[:, 0]
-    closed = bool(usable_intrinsics(unit[:, None])[0])
-    choices = [unit]
-    if not closed:
-        choices = [np.array([f, f, 0.0, 0.0, 0.0]) for f in _FOCAL_LENGTHS]
+    """One camera where no closed form is: the best of some focal lengths, adjusted."""
+    homographies = _homographies(model, [image], model.pixels)
     best, least = None, np.inf
-    for choice in choices:
-        poses = _metric(model, choice, homographies)
-        vector = choice * image.scale
+    for focal in _FOCAL_LENGTHS:
+        unit = np.array([focal, focal, 0.0, 0.0, 0.0])
+        rotation, translation = _metric(model, unit[:, None], homographies)
+        vector = unit * image.scale
         vector[3:] += image.centre
-        state = TargetState(
-            vector[None], (lens,), np.eye(3)[None], np.zeros((1, 3)), *poses
-        )
-        if closed:
-            return state
+        place = np.eye(3)[None], np.zeros((1, 3))
+        state = TargetState(vector[None], (lens,), *place, rotation[0], translation[0])
         end = minimise(
             model.evaluate, model.retract, state, 0.0, tolerance=_ROUGH, damping=DAMPING
         )
@@ -139,17 +138,23 @@ def _one_camera(
     return best
 
 
-def _homographies(model: TargetModel, image: ImageScale, pixels: Floats) -> Floats:
-    """Of each view, (3, 3, n, 1), from pixels (2, n, p), without lens."""
+def _homographies(
+    model: TargetModel, images: list[ImageScale], pixels: Floats
+) -> Floats:
+    """Of each camera's views, (3, 3, n, m), from pixels (m, 2, n, p), without lens."""
     centre, size = _target_scale(model)
     plane = (model.plane - centre[:, None]) / size
     seen = None
-    if not model.complete[0]:
-        seen = model.seen[0].T[..., None].astype(float)
-    scaled = (pixels - image.centre[:, None, None]) / image.scale
+    if not all(model.complete):
+        seen = model.seen.transpose(2, 1, 0).astype(float)
+    middle = np.array([image.centre for image in images])
+    scale = np.array([image.scale for image in images])
+    scaled = (pixels - middle[..., None, None]) / scale[:, None, None, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         return linear_homographies(
-            plane[:, :, None, None], scaled.transpose(0, 2, 1)[..., None], seen
+            plane[:, :, None, None],
+            np.ascontiguousarray(scaled.transpose(1, 3, 2, 0)),
+            seen,
         )
 
 
@@ -161,11 +166,11 @@ def _target_scale(model: TargetModel) -> tuple[Floats, float]:
 def _metric(
     model: TargetModel, unit: Floats, homographies: Floats
 ) -> tuple[Floats, Floats]:
-    """camera_from_target of each view: (n, 3, 3), (n, 3), metres."""
+    """camera_from_target of each camera's views: (m, n, 3, 3), (m, n, 3), metres."""
     centre, size = _target_scale(model)
-    rotation, translation = poses_from_homographies(unit[:, None], homographies)
-    turned = np.moveaxis(rotation[..., 0], -1, 0)
-    return turned, size * translation[..., 0].T - turned[:, :, :2] @ centre
+    rotation, translation = poses_from_homographies(unit, homographies)
+    turned = np.ascontiguousarray(rotation.transpose(3, 2, 0, 1))
+    return turned, size * translation.transpose(2, 1, 0) - turned[..., :2] @ centre
 
 
 def _poses(
@@ -187,7 +192,12 @@ def _poses(
         )
     unit = intrinsics.copy()
     unit[3:] -= image.centre
-    return _metric(model, unit / image.scale, _homographies(model, image, pixels))
+    rotation, translation = _metric(
+        model,
+        unit[:, None] / image.scale,
+        _homographies(model, [image], pixels[None]),
+    )
+    return rotation[0], translation[0]
 
 
 def _placed(

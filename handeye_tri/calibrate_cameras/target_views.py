@@ -42,9 +42,8 @@ Floats = NDArray[np.float64]
 # A view of fewer points says less than its pose asks.
 _LEAST_POINTS = 4
 _LEAST_VIEWS = 3
-# The last step of all unknowns together is at most a hundredth of their sigma, and the
-# one after would be a tenth of it or less.
-_TOLERANCE = 1e-4
+# What a further step of all unknowns together would be: sigma over three hundred.
+_TOLERANCE = 1e-5
 # Points whose smaller spread is less than this part of the larger are on a line.
 _MIN_WIDTH = 1e-3
 
@@ -141,6 +140,7 @@ def calibrate_target_views(
         rounding,
         tolerance=_TOLERANCE,
         damping=DAMPING,
+        foresee=True,
     )
     if end is None:
         raise DegenerateMotionError(
