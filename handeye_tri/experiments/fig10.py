@@ -242,7 +242,7 @@ def _drawn(
     figure: Any = Figure(figsize=(12.0, 9.6), layout="constrained")
     for k, (image, pixels) in enumerate(zip(images, found.pixels, strict=True)):
         panel = figure.add_subplot(2, 2, k + 1)
-        panel.imshow(image)
+        panel.imshow(image, interpolation="nearest")
         panel.plot(*pixels.T, "+", color="white", markersize=12, markeredgewidth=3)
         panel.plot(*pixels.T, "+", color="#e53935", markersize=11, markeredgewidth=1.4)
         low, high = pixels.min(axis=0) - 40, pixels.max(axis=0) + 40

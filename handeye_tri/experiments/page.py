@@ -12,7 +12,7 @@ from handeye_tri.experiments.outcome import Outcome
 from handeye_tri.storage import write_bytes
 
 # A longer table is only linked to.
-_LONGEST_TABLE = 30
+_LONGEST_TABLE = 40
 
 _PAGE = """<!doctype html>
 <html lang="en">
