@@ -107,6 +107,11 @@ def require(run: Run, stages: Mapping[str, Stage], stage: Stage) -> None:
         require(run, stages, stages[name])
     state, why = run.folder.state(stage.name, inputs_of(run, stage))
     if state != "done":
+        if stage.verb == "import":
+            raise StorageError(
+                f"{run.folder.path}: what was imported is needed first: {why}; import "
+                f"it again into another folder, as before: {run.imported_by}"
+            )
         raise StorageError(
             f"{run.folder.path}: the stage {stage.name!r} is needed first: {why}; "
             f"run: handeye-tri {stage.verb} {run.folder.path}"

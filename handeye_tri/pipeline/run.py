@@ -166,6 +166,24 @@ class Run:
         return self.cell
 
     @property
+    def imported_by(self) -> str:
+        """The command that imported the session; "" where it was simulated.
+
+        Raises:
+            StorageError: session.json does not say it as it should.
+        """
+        source = self.folder.header.get("source")
+        if source is None:
+            return ""
+        command = source.get("command") if isinstance(source, dict) else None
+        if not isinstance(command, str) or not command:
+            raise StorageError(
+                f"{self.folder.path / 'session.json'}: source.command is missing or "
+                "wrong; import the data again into another folder"
+            )
+        return command
+
+    @property
     def has_robot(self) -> bool:
         """Whether there is a model of the robot and joints of every station."""
         named = bool(self.folder.header["model_file"])

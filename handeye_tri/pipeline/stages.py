@@ -222,9 +222,8 @@ def _report(run: Run) -> tuple[list[str], str]:
         origin=Origin(
             cell=run.cell.name,
             seed=run.seed,
-            command=str(header["source"]["command"])
-            if "source" in header
-            else f"handeye-tri run {header['cell_file']} -o {run.folder.path} "
+            command=run.imported_by
+            or f"handeye-tri run {header['cell_file']} -o {run.folder.path} "
             f"--seed {run.seed} --half-turns {header['half_turns']}",
             software=header["software"],
             files={
@@ -295,7 +294,7 @@ STAGES = {
 def _not_again(run: Run) -> tuple[list[str], str]:
     raise StorageError(
         f"{run.folder.path}: what was imported is missing or damaged; import it again "
-        f"into another folder: {run.folder.header['source']['command']}"
+        f"into another folder: {run.imported_by}"
     )
 
 
@@ -308,7 +307,7 @@ _IMPORTED = {
 
 def stages_of(run: Run) -> dict[str, Stage]:
     """The stages of a session: all, or those of an imported one."""
-    return {**STAGES, **_IMPORTED} if run.folder.header.get("source") else STAGES
+    return {**STAGES, **_IMPORTED} if run.imported_by else STAGES
 
 
 VERBS = tuple(dict.fromkeys(stage.verb for stage in STAGES.values()))

@@ -155,7 +155,7 @@ def plan_from_json(data: Mapping[str, Any]) -> Plan:
         findings=tuple(str(line) for line in data["findings"]),
         via=tuple(
             array(s["via_rad_or_m"], "via_rad_or_m").reshape(
-                -1, len(s["joints_rad_or_m"])
+                len(s["via_rad_or_m"]), len(s["joints_rad_or_m"])
             )
             for s in data["stations"]
         ),

@@ -177,3 +177,40 @@ def test_what_does_not_fit_is_one_sentence_and_writes_nothing(
     assert message in err
     assert len(err.splitlines()) == 1
     assert not (tmp_path / "new").exists()
+
+
+def test_damage_to_what_was_imported_says_how_to_have_it_again(capsys, both, tmp_path):
+    import shutil
+
+    _, back, _ = both
+    folder = tmp_path / "copy"
+    shutil.copytree(back.folder.path, folder)
+    image = folder / "images" / "left_003.png"
+    data = bytearray(image.read_bytes())
+    data[len(data) // 2] ^= 1
+    image.write_bytes(bytes(data))
+    code, _, err = call(capsys, "detect", folder, "--again")
+    assert code == 2
+    assert "left_003.png was changed or damaged" in err
+    assert "import it again into another folder" in err
+    header = json.loads((folder / "session.json").read_text())
+    for source in (7, {}, {"command": ["x"]}):
+        changed = json.dumps({**header, "source": source})
+        (folder / "session.json").write_text(changed)
+        code, _, err = call(capsys, "detect", folder)
+        assert code == 2
+        assert "source.command is missing or wrong" in err
+
+
+def test_without_the_extra_one_sentence_says_how_to_get_it(
+    capsys, both, tmp_path, monkeypatch
+):
+    import sys
+
+    _, back, _ = both
+    monkeypatch.setitem(sys.modules, "mcap_ros2", None)
+    bag = back.folder.path.parent / "session.mcap"
+    code, _, err = call(capsys, "import", "bag", bag, "-o", tmp_path / "new")
+    assert code == 2
+    assert 'install them with: pip install "handeye-tri[ros]"' in err
+    assert len(err.splitlines()) == 1
