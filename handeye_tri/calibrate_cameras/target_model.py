@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from handeye_tri.calibrate_cameras.least_squares import NormalEquations
 from handeye_tri.calibrate_cameras.trial_equations import Scratch
-from handeye_tri.camera import distort_components
+from handeye_tri.camera import distort, distort_components
 from handeye_tri.se3 import hat, so3_exp
 
 Floats = NDArray[np.float64]
@@ -337,14 +337,15 @@ class TargetModel:
 
     def residuals(self, state: TargetState) -> Floats:
         """Detected less predicted, shape (m, n, p, 2), px, NaN where unseen."""
-        m, _, n, p = self.pixels.shape
-        result = np.full((m, n, p, 2), np.nan)
-        poses = self.in_cameras(state)
-        for block in self._blocks():
-            rows = self._rows(state, poses, block)
-            assert rows is not None
-            np.negative(rows[0][-1], out=result[block][..., 0])
-            np.negative(rows[1][-1], out=result[block][..., 1])
+        rotation, translation = self.in_cameras(state)
+        local = rotation[..., :2] @ self.plane + translation[..., None]
+        result = np.empty((*self.seen.shape, 2))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = (local[..., :2, :] / local[..., 2:, :]).swapaxes(-1, -2)
+        for i, (fx, fy, skew, cx, cy) in enumerate(state.intrinsics):
+            x, y = np.moveaxis(distort(state.lenses[i], xy[i]), -1, 0)
+            result[i, ..., 0] = self.pixels[i, 0] - (fx * x + skew * y + cx)
+            result[i, ..., 1] = self.pixels[i, 1] - (fy * y + cy)
         if not all(self.complete):
             result[~self.seen] = np.nan
         return result

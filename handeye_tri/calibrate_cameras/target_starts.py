@@ -183,10 +183,8 @@ def _poses(
         fx, fy, skew, cx, cy = intrinsics
         y = (pixels[1] - cy) / fy
         distorted = np.stack([(pixels[0] - cx - skew * y) / fx, y], axis=-1)
-        ideal = distorted
         # A start needs no better inverse of the lens.
-        for _ in range(2):
-            ideal = distorted - (distort(lens, ideal) - ideal)
+        ideal = 2.0 * distorted - distort(lens, distorted)
         pixels = np.stack(
             [fx * ideal[..., 0] + skew * ideal[..., 1] + cx, fy * ideal[..., 1] + cy]
         )

@@ -42,8 +42,8 @@ Floats = NDArray[np.float64]
 # A view of fewer points says less than its pose asks.
 _LEAST_POINTS = 4
 _LEAST_VIEWS = 3
-# What a further step of all unknowns together would be: sigma over three hundred.
-_TOLERANCE = 1e-5
+# A further step of all unknowns together would be a hundredth of their sigma at most.
+_TOLERANCE = 1e-4
 # Points whose smaller spread is less than this part of the larger are on a line.
 _MIN_WIDTH = 1e-3
 
