@@ -98,7 +98,7 @@ def certify(
         "axis_spread": axis_spread(base_from_flange[:, :3, :3]),
         "rank": float((values > _NO_INFORMATION).sum()),
         "unknowns": float(len(values)),
-        "condition": float(values[-1] / max(values[0], _EPSILON * values[-1])),
+        "condition": _condition(values),
     }
     for label in covariance.labels:
         owner, quantity = label.rsplit(".", 1)
@@ -135,6 +135,13 @@ def _scaled_spectrum(information: Floats) -> tuple[Floats, Floats]:
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
     return np.asarray(values), np.asarray(vectors)
+
+
+def _condition(values: Floats) -> float:
+    """Largest over smallest eigenvalue, at most 1 over the machine's precision."""
+    if values[-1] <= 0:
+        return 1 / _EPSILON
+    return float(values[-1] / max(values[0], _EPSILON * values[-1]))
 
 
 def _undetermined(labels: tuple[str, ...], values: Floats, vectors: Floats) -> str:
