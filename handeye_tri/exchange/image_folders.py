@@ -36,7 +36,7 @@ def find_images(source: Path, patterns: Mapping[str, str]) -> dict[str, list[Pat
     for camera, pattern in patterns.items():
         if Path(pattern).is_absolute() or ".." in Path(pattern).parts or not pattern:
             raise InputError(
-                f"--image {camera}={pattern}: the pattern must stay below {source}"
+                f"--image {camera}={pattern!r:.80}: it must stay below {source}"
             )
         try:
             paths = [
@@ -46,7 +46,8 @@ def find_images(source: Path, patterns: Mapping[str, str]) -> dict[str, list[Pat
             ]
         except (ValueError, NotImplementedError, IndexError, OSError) as error:
             raise InputError(
-                f"--image {camera}={pattern:.80}: this is no pattern ({error!s:.80})"
+                f"--image {camera}={pattern!r:.80}: this is no pattern "
+                f"({type(error).__name__})"
             ) from None
         if not paths:
             raise InputError(
@@ -152,7 +153,7 @@ def timed_images(paths: Sequence[Path], unit: TimeUnit) -> ImageStream:
         pattern = r"\d{1,20}" if unit == "ns" else r"\d{1,12}(\.\d{1,12})?"
         if not re.fullmatch(pattern, path.stem):
             raise InputError(
-                f"{path.parent}: the name {path.name!r:.80} is no time in {unit}"
+                f"the image {str(path)!r:.160} has a name that is no time in {unit}"
             )
         times.append(int(path.stem) / 1e9 if unit == "ns" else float(path.stem))
     return _ordered(list(paths), times, "their names")

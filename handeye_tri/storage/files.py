@@ -21,6 +21,7 @@ from handeye_tri.errors import StorageError
 # Larger than any calibration image or record of ours; refuses bombs.
 _MAX_BYTES = 256 * 1024 * 1024
 _MAX_PIXELS = 100_000_000
+_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -178,6 +179,7 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
     """
     from PIL import Image, UnidentifiedImageError
 
+    _check_png(data, name)
     try:
         with Image.open(io.BytesIO(data)) as picture:
             width, height = picture.size
@@ -206,3 +208,23 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
         raise StorageError(
             f"{name}: this image is damaged ({error}); take or render it again"
         ) from None
+
+
+def _check_png(data: bytes, name: str) -> None:
+    """Verify a PNG's checksums, which Pillow leaves out where the pixels are."""
+    if not data.startswith(_PNG):
+        return
+    place = len(_PNG)
+    while place + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, place)
+        end = place + 8 + length
+        checksum = data[end : end + 4]
+        if zlib.crc32(data[place + 4 : end]).to_bytes(4, "big") != checksum:
+            raise StorageError(
+                f"{name}: this image is damaged (checksum at byte {place}); take or "
+                "render it again"
+            )
+        if kind == b"IEND":
+            return
+        place = end + 4
+    raise StorageError(f"{name}: this image is cut off; take or render it again")

@@ -172,6 +172,7 @@ def test_cells_from_recordings(data):
 @example("**")
 @example("a/../b")
 @example("/etc/*")
+@example("/\n")
 def test_words_of_the_command_line(tmp_path, text):
     only_clear_errors(lambda: PoseFormat.parse(text))
     only_clear_errors(lambda: parse_pairs(text, "--half-turns"))
@@ -206,6 +207,8 @@ PICTURES = {kind: encoded(kind) for kind in ("PNG", "JPEG", "BMP", "TIFF", "PPM"
     st.lists(st.tuples(st.floats(0, 1), st.integers(0, 7)), min_size=1, max_size=3),
     st.booleans(),
 )
+# A bit of the pixels that Pillow alone lets pass.
+@example(kind="PNG", flips=[(0.87109375, 0)], cut=False)
 @pytest.mark.filterwarnings("ignore")
 def test_damaged_images(kind, flips, cut):
     data = bytearray(PICTURES[kind])
