@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 
 from handeye_tri.calibrate_cameras import calibrate_target_views, calibrate_trials
 from handeye_tri.calibrate_cameras.target_model import TargetModel, TargetState
+from handeye_tri.calibrate_cameras.target_starts import closed_forms
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera, StereoRig
 from handeye_tri.se3 import SE3, rotation_from_quaternion_wxyz, so3_exp
 from handeye_tri.triangle import TriangleRig
@@ -189,10 +190,19 @@ def opencv(factory: str, n: int, peers: Peers) -> Measured:
 
 
 def gtsam(n: int, peers: Peers) -> Measured:
-    pixels, _, poses = target_pixels(n)
-    k = rig().left.intrinsics
-    # A per cent from the truth, as a closed form is.
-    start = ((1.01 * k.fx, 1.01 * k.fy, k.cx + 5.0, k.cy - 5.0), poses)
+    """From the closed form that we start from, too, without its cost."""
+    pixels = target_pixels(n)[0][:1]
+    model = TargetModel(
+        np.ascontiguousarray(POINTS[:, :2].T),
+        np.ascontiguousarray(np.moveaxis(pixels, -1, 1)),
+        np.ones(pixels.shape[:3], dtype=bool),
+        (0, 1, 3, 4),
+        (0, 1, 2, 3),
+    )
+    found = closed_forms(model, [IMAGE_SIZE], ["camera"])
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = found.rotation, found.translation
+    start = (found.intrinsics[0, [0, 1, 3, 4]], poses)
     arguments = (POINTS, pixels[0], start)
     return peers.elsewhere("bench_peers", "gtsam_camera", arguments, needs="gtsam")
 

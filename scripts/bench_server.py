@@ -21,15 +21,19 @@ from typing import Any
 
 
 def seconds(call: Callable[[], Any], least: float) -> tuple[float, Any]:
-    """Best wall time of one call within about ``least`` seconds, and its result."""
-    best, spent, result = float("inf"), 0.0, None
-    while spent < least or best == float("inf"):
+    """Mean wall time of one call over about ``least`` seconds, and its result.
+
+    The mean, not the best: a busy machine delays long calls and short ones alike, and
+    the best of many short ones would hide that.
+    """
+    spent, calls, result = 0.0, 0, None
+    while calls == 0 or spent < least:
         result = None
         started = time.perf_counter()
         result = call()
-        took = time.perf_counter() - started
-        best, spent = min(best, took), spent + took
-    return best, result
+        spent += time.perf_counter() - started
+        calls += 1
+    return spent / calls, result
 
 
 def peak_bytes(call: Callable[[], Any]) -> tuple[float, Any]:

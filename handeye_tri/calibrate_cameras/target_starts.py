@@ -50,9 +50,9 @@ def start_of(
     usable = np.asarray(model.seen.any(axis=2))
     few = np.unique(np.concatenate([_spread(np.flatnonzero(one)) for one in usable]))
     if len(few) == n:
-        return _closed_forms(model, image_sizes, names)
+        return closed_forms(model, image_sizes, names)
     part = model.take(list(range(m)), few)
-    state = _closed_forms(part, image_sizes, names)
+    state = closed_forms(part, image_sizes, names)
     end = minimise(
         part.evaluate, part.retract, state, 0.0, tolerance=_ROUGH, damping=DAMPING
     )
@@ -83,10 +83,22 @@ def _spread(views: Indices) -> Indices:
     return views[np.linspace(0, len(views) - 1, _FEW_VIEWS).astype(np.intp)]
 
 
-def _closed_forms(
+def closed_forms(
     model: TargetModel, image_sizes: list[tuple[int, int]], names: list[str]
 ) -> TargetState:
-    """Each camera from its own views, then the places from the views they share."""
+    """Each camera from its own views, then the places from the views they share.
+
+    Args:
+        model: The cameras' views of the target; each camera has usable ones.
+        image_sizes: (width, height) of each camera, pixels.
+        names: Of the cameras.
+
+    Returns:
+        Cameras without lens, their places, and the pose of each view.
+
+    Raises:
+        DegenerateMotionError: no camera fits one camera's views.
+    """
     m = len(model.pixels)
     images = [ImageScale.of(size) for size in image_sizes]
     usable = np.asarray(model.seen.any(axis=2))
