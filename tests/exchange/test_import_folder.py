@@ -309,7 +309,10 @@ def test_what_is_not_said_is_asked_for(capsys, bench, tmp_path):
     folder = bench[0]
     for arguments, message in (
         (("--pose-format", "rotation-vector:m,rad"), "--direction flange_in_base"),
-        (("--direction", "base_in_flange", "--image", "left=../*"), "it must stay below"),
+        (
+            ("--direction", "base_in_flange", "--image", "left=../*"),
+            "it must stay below",
+        ),
     ):
         code, _, err = imported(
             capsys, bench, tmp_path / "s", "--poses", path, *arguments
