@@ -12,6 +12,7 @@ from bench_rows import Gate, Measured, Peers, Row, here
 from scipy.optimize import least_squares
 
 from handeye_tri.calibrate_cameras import calibrate_target_views, calibrate_trials
+from handeye_tri.calibrate_cameras.least_squares import one_thread
 from handeye_tri.calibrate_cameras.target_model import TargetModel, TargetState
 from handeye_tri.calibrate_cameras.target_starts import closed_forms
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera, StereoRig
@@ -273,9 +274,10 @@ def one_pass(m: int, n: int) -> Callable[[], Any]:
     model = replace(model, pixels=off - np.moveaxis(model.residuals(state), -1, 1))
 
     def work() -> Any:
-        rows = model.evaluate(state)
-        assert rows is not None
-        return rows.equations().step(1e-4)
+        with one_thread():
+            rows = model.evaluate(state)
+            assert rows is not None
+            return rows.equations().step(1e-4)
 
     return work
 

@@ -9,6 +9,7 @@ grows in proportion to the blocks. Unknowns that no residual depends on stay put
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
 from typing import Generic, Protocol, TypeVar
@@ -221,7 +222,7 @@ def minimise(
         The minimum; None where the start cannot be evaluated.
     """
     # Many products of small matrices: threads cost more than they bring.
-    with _blas().limit(limits=1):
+    with one_thread():
         return _minimise(
             evaluate,
             retract,
@@ -233,6 +234,12 @@ def minimise(
             damping,
             foresee,
         )
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Keeps numpy's libraries on one thread inside a with statement."""
+    limit: AbstractContextManager[object] = _blas().limit(limits=1)
+    return limit
 
 
 @cache

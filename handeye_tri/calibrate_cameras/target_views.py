@@ -17,7 +17,7 @@ from handeye_tri.calibrate_cameras.degeneracy import (
     MAX_RELATIVE_SIGMA,
     invert_information,
 )
-from handeye_tri.calibrate_cameras.least_squares import Minimum, minimise
+from handeye_tri.calibrate_cameras.least_squares import Minimum, minimise, one_thread
 from handeye_tri.calibrate_cameras.options import lens_choice
 from handeye_tri.calibrate_cameras.target_model import (
     TargetModel,
@@ -131,34 +131,44 @@ def calibrate_target_views(
             f"{2 * int(seen.sum())} pixel coordinates are too few for "
             f"{6 * len(used) + model.shared_unknowns} unknowns; add views or points"
         )
-    start = start_of(model, sizes, labels)
-    rounding = float(np.finfo(float).eps * np.abs(model.pixels).max())
-    end = minimise(
-        model.evaluate,
-        model.retract,
-        start,
-        rounding,
-        tolerance=_TOLERANCE,
-        damping=DAMPING,
-        foresee=True,
-    )
-    if end is None:
-        raise DegenerateMotionError(
-            "the cameras' places, from the poses that they share, put a point behind "
-            "one of them; check that the views of all cameras are in the same order"
+    with one_thread():
+        start = start_of(model, sizes, labels)
+        rounding = float(np.finfo(float).eps * np.abs(model.pixels).max())
+        end = minimise(
+            model.evaluate,
+            model.retract,
+            start,
+            rounding,
+            tolerance=_TOLERANCE,
+            damping=DAMPING,
+            foresee=True,
         )
-    noise = end.cost / dof if sigma_px is None else sigma_px**2
-    covariance, condition = _covariance(model, end, labels, lens_model, noise)
-    if not end.converged:
-        raise ConvergenceError(
-            f"the adjustment did not settle in {end.iterations} iterations (cost "
-            f"{end.cost_start:.4g} to {end.cost:.4g} px^2); estimate fewer lens "
-            "coefficients or add views"
+        if end is None:
+            raise DegenerateMotionError(
+                "the cameras' places, from the poses that they share, put a point "
+                "behind one of them; check that the views of all cameras are in the "
+                "same order"
+            )
+        noise = end.cost / dof if sigma_px is None else sigma_px**2
+        covariance, condition = _covariance(model, end, labels, lens_model, noise)
+        if not end.converged:
+            raise ConvergenceError(
+                f"the adjustment did not settle in {end.iterations} iterations (cost "
+                f"{end.cost_start:.4g} to {end.cost:.4g} px^2); estimate fewer lens "
+                "coefficients or add views"
+            )
+        scale = 1.0 if sigma_px is None else sigma_px**2
+        return _result(
+            model,
+            end,
+            labels,
+            sizes,
+            lens_model,
+            covariance,
+            condition,
+            scale,
+            (n, used),
         )
-    scale = 1.0 if sigma_px is None else sigma_px**2
-    return _result(
-        model, end, labels, sizes, lens_model, covariance, condition, scale, (n, used)
-    )
 
 
 def _target(points: ArrayLike) -> Floats:
