@@ -182,17 +182,17 @@ def distort_components(coefficients: Floats, x: Floats, y: Floats) -> Distorted:
     radial, slope, denominator = _radial(coefficients, square)
     slope = slope + slope
     by_lens = np.empty((2, len(coefficients), *square.shape))
-    twice = np.add(xy, xy, out=by_lens[0, 2])
+    twice = np.add(xy, xy, out=by_lens[0, 2, ...])
     by_lens[1, 3] = twice
-    by_p1 = np.add(square + xx, xx, out=by_lens[0, 3])
-    by_p2 = np.add(square + yy, yy, out=by_lens[1, 2])
+    by_p1 = np.add(square + xx, xx, out=by_lens[0, 3, ...])
+    by_p2 = np.add(square + yy, yy, out=by_lens[1, 2, ...])
     power = square if denominator is None else square / denominator
     for k in (0, 1, 4):
-        np.multiply(x, power, out=by_lens[0, k])
-        np.multiply(y, power, out=by_lens[1, k])
+        np.multiply(x, power, out=by_lens[0, k, ...])
+        np.multiply(y, power, out=by_lens[1, k, ...])
         power = power * square
     if len(coefficients) == 8:
-        np.multiply(-radial, by_lens[:, [0, 1, 4]], out=by_lens[:, 5:])
+        np.multiply(-radial, by_lens[:, [0, 1, 4]], out=by_lens[:, 5:, ...])
     tilt = p1 * y + p2 * x
     tilt += tilt
     middle = radial + tilt
