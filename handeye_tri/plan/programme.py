@@ -296,7 +296,13 @@ class _Planner:
         spread = plane_angles(normals[:, None], normals[None]) >= least
         times = np.where(spread, self.route.time(end[:, None], begin[None]), np.inf)
         start = self.visited.joints
-        stops = Stops(stop, self.route.time(start, begin), times)
+        first = self.route.time(start, begin)
+        if len(self.visited.turns):
+            before = self.visited.base_from_flange[self.visited.turns[-1, :1]]
+            world = self.arm.base_from_world.inverse().matrix @ before
+            apart = plane_angles(self.view.normals(world), normals)
+            first = np.where(apart >= least, first, np.inf)
+        stops = Stops(stop, first, times)
         route = self.route.drive(stops, start, begin, end)
         if route is not None:
             return [options[k] for k in route.order], route.via

@@ -310,6 +310,10 @@ def test_what_is_planned_next_adds_most_to_what_was_seen():
     more = plan_next(cell, arm, visited, 1, 2)
     assert [s.kind for s in more.stations] == ["calibration"] * 4
     assert [(t.before, t.after) for t in more.half_turns] == [(0, 1), (2, 3)]
+    assert more.outcome == "PASS", more.findings
+    # The first new plane is spread from the last one that was seen, too.
+    least = cell.plan.min_plane_spread_deg
+    assert more.certificate["plane_spread_deg"] >= least
     model = StationInformation(
         View(cell), arm.base_from_world.matrix, cell.repeatability, 0.03
     )
