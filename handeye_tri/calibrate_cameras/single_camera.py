@@ -29,7 +29,7 @@ from handeye_tri.calibrate_cameras.intrinsic_choice import (
     split_fixed,
 )
 from handeye_tri.calibrate_cameras.lens_selection import lens_advice
-from handeye_tri.calibrate_cameras.lens_verdict import judge_lens
+from handeye_tri.calibrate_cameras.lens_verdict import centre_weakness, judge_lens
 from handeye_tri.calibrate_cameras.options import (
     lens_choice,
     o_choice,
@@ -152,7 +152,9 @@ def calibrate_camera(
         - "lens_verdict": a :class:`LensVerdict` for each lens coefficient estimated:
           its effect in pixels, that of its sigma, and whether it is determined;
         - "weaknesses": sentences on what makes fx or fy uncertain by more than a
-          fiftieth (a small target, low tilt, few half-turns), and the remedy;
+          fiftieth (a small target, low tilt, few half-turns), and the remedy; also
+          where a lens bends so much about its uncertain centre that ``covariance``
+          is too small;
         - "dropped": with ``reject``, why each half-turn was dropped, by index;
         - "used": indices of the half-turns used; "plane_spread_deg"; "start";
           "iterations".
@@ -261,13 +263,16 @@ def calibrate_camera(
     if lens:
         both = np.stack([outcome.state.poses, model.after_poses(outcome.state)], 1)
         seen = triangle.points @ np.swapaxes(both[..., :3, :3], -1, -2)
+        seen = seen + both[..., None, :3, 3]
         inner_count = len(choice.names)
         details["lens_verdict"] = judge_lens(
             camera,
             outcome.covariance[inner_count:, inner_count:],
             names[inner_count:],
-            seen + both[..., None, :3, 3],
+            seen,
         )
+        bent = centre_weakness(camera, outcome.covariance, names, seen)
+        details["weaknesses"] += () if bent is None else (bent,)
     residuals = np.full((1, 2 * n, 3, 2), np.nan)
     missed = data.pixels - model.predict(outcome.state)
     residuals[0, used], residuals[0, n + used] = missed[:, 0], missed[:, 1]

@@ -118,3 +118,45 @@ def test_refusal_says_which_coefficients_the_data_determine() -> None:
     assert f"chi2 is then {result.chi2:.4g} for {result.dof} degrees" in str(
         caught.value
     )
+
+
+def test_covariance_about_an_uncertain_lens_centre_is_said_to_be_too_small() -> None:
+    lens = Lens("radtan", np.array([-0.21, 0.13, 1e-3, -6e-4, 0.0]))
+    scene = make_scene(
+        np.random.default_rng(2), 11, view=camera(lens=lens), sideways=0.25
+    )
+    options = {"image_size": IMAGE_SIZE, "distortion": ("k1", "k2", "p1", "p2")}
+    known = {"fixed": {"cx": 519.3, "cy": 377.8}}
+    nees = []
+    for trial in range(60):
+        seen = scene.noisy(np.random.default_rng([12, trial]), 1.0)
+        result = calibrate_camera(
+            *seen, scene.triangle, sigma_px=1.0, **options, **known
+        )
+        assert not any("too small" in said for said in result.details["weaknesses"])
+        labels = [label.split(".")[1] for label in result.covariance.labels]
+        of = [
+            dict(
+                zip(
+                    ("fx", "fy", "skew", "cx", "cy"),
+                    view.intrinsics.vector,
+                    strict=True,
+                )
+            )
+            | dict(zip(view.lens.names, view.lens.coefficients, strict=True))
+            for view in (result.camera, scene.camera)
+        ]
+        error = np.array([of[0][name] - of[1][name] for name in labels])
+        nees.append(error @ np.linalg.solve(result.covariance.matrix, error))
+    # Of 60 chi-square variables with 7 degrees of freedom: 1 +- 0.07.
+    assert abs(np.mean(nees) / 7 - 1) < 0.25
+
+    def said(sigma: float) -> list[str]:
+        seen = scene.noisy(np.random.default_rng(13), sigma)
+        result = calibrate_camera(*seen, scene.triangle, sigma_px=sigma, **options)
+        return [one for one in result.details["weaknesses"] if "too small" in one]
+
+    assert said(0.05) == []
+    (sentence,) = said(0.5)
+    assert re.match(r"cx \d+\.\d \+- \d+ px, cy \d+\.\d \+- \d+ px", sentence)
+    assert "give cx and cy in fixed" in sentence
