@@ -17,7 +17,7 @@ exceeds 1.15 times the bound, NEES with a lens leaves 0.9 to 1.1, or a run fails
 fewer trials these bands are wider, as the statistics scatter more.
 
 A lens is centred at the principal point. Where that is known, NEES with the lens is
-judged at every noise; where it is estimated, at 0.1 px (k1 alone: to 0.3 px). Beyond,
+judged to 1 px (k1 k2 p1 p2: 0.3); where it is estimated, to 0.1 px (k1: 0.3). Beyond,
 the estimate is still the maximum of the likelihood, but the linear covariance is too
 small along its short axes: the table shows by how much, and how often ("warned") the
 result says so itself.
@@ -68,9 +68,12 @@ METHODS: dict[str, dict[str, Any]] = {
 NAMES = ("fx", "fy", "skew", "cx", "cy")
 LENS = Lens("radtan", np.array([-0.21, 0.13, 1e-3, -6e-4, 0.0]))
 LENSES = (("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"))
-# Up to which noise the linear covariance of a lens must hold with its centre
-# estimated too; with the centre known it must at every noise.
-LINEAR_UP_TO_PX = {"k1": 0.3, "k1 k2": 0.1, "k1 k2 p1 p2": 0.1}
+# Up to which noise the linear covariance of a lens must hold, by what is known of its
+# centre.
+LINEAR_UP_TO_PX = {
+    "known": {"k1": 1.0, "k1 k2": 1.0, "k1 k2 p1 p2": 0.3},
+    "estimated": {"k1": 0.3, "k1 k2": 0.1, "k1 k2 p1 p2": 0.1},
+}
 TURN_COVARIANCE = np.diag([3e-5**2] * 3 + [np.radians(0.005) ** 2] * 3)
 
 
@@ -259,7 +262,7 @@ def lenses(n: int, trials: int) -> list[str]:
                 + [f"{100 * found.undetermined:.0f} %", f"{100 * found.warned:.0f} %"]
                 + [str(found.failed), f"{found.milliseconds:.1f}"]
             )
-            if centre == "known" or sigma <= LINEAR_UP_TO_PX[lens]:
+            if sigma <= LINEAR_UP_TO_PX[centre][lens]:
                 where = f"{section}, {sigma} px, lens {lens}, centre {centre}"
                 if found.failed:
                     missed.append(f"{where}: {found.failed} failed")
