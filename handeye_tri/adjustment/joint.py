@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
 
 from handeye_tri.adjustment.model import AdjustmentModel, Linearisation
 from handeye_tri.adjustment.problem import Sides, State, Stations
@@ -17,7 +15,7 @@ from handeye_tri.adjustment.robot import RobotParameters, determined
 from handeye_tri.adjustment.robust import Loss
 from handeye_tri.calibrate_cameras.bundle_input import observations, pairs, unknowns
 from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
-from handeye_tri.calibrate_cameras.least_squares import Minimum, minimise
+from handeye_tri.calibrate_cameras.least_squares import Minimum, minimise, one_thread
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
 from handeye_tri.errors import ConvergenceError, DegenerateMotionError, InputError
 from handeye_tri.records import HandEyeCalibration, Repeatability, Session
@@ -98,16 +96,10 @@ def adjust(
     """
     _check(session, start, side_sigma, robot_parameters, on_axis_correlation)
     # Products of a few hundred numbers a side: threads cost more than they bring.
-    with _blas().limit(limits=1):
+    with one_thread():
         return _adjusted(
             session, start, side_sigma, loss, robot_parameters, on_axis_correlation
         )
-
-
-@cache
-def _blas() -> ThreadpoolController:
-    """The libraries behind numpy, found once."""
-    return ThreadpoolController().select(user_api="blas")
 
 
 def _adjusted(
