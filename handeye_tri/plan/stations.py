@@ -10,13 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 from handeye_tri.arm import Arm
 from handeye_tri.config import Cell
 from handeye_tri.errors import InputError
+from handeye_tri.exchange.half_turns import turn_between
 from handeye_tri.plan.candidates import SIGHT_MARGIN
 from handeye_tri.plan.certificate import certify
 from handeye_tri.plan.information import EXPECTED_SIGMA_PX, StationInformation
-from handeye_tri.plan.poses import HALF_TURN, View
+from handeye_tri.plan.poses import View
 from handeye_tri.plan.sequence import travel_time
 from handeye_tri.records import HalfTurn, Plan, Station
-from handeye_tri.se3 import SE3, se3_inverse, so3_log
+from handeye_tri.se3 import SE3
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -87,12 +88,13 @@ def certify_stations(cell: Cell, arm: Arm, joints: ArrayLike) -> Plan:
 def _half_turns(poses: Floats) -> NDArray[np.intp]:
     """Successive stations that differ by a half-turn, shape (k, 2); none twice."""
     found: list[tuple[int, int]] = []
-    for k, (first, second) in enumerate(pairwise(poses)):
+    for k in range(len(poses) - 1):
         if found and found[-1][1] == k:
             continue
-        rest = se3_inverse(first @ HALF_TURN) @ second
-        turn = np.linalg.norm(so3_log(rest[:3, :3]))
-        if turn < _TURN_TOLERANCE and np.linalg.norm(rest[:3, 3]) < _SHIFT_TOLERANCE:
+        turn = turn_between(poses, k, k + 1)
+        tilt = np.arccos(min(1.0, abs(float(turn.axis[2]))))
+        off = max(abs(turn.pitch), float(np.linalg.norm(turn.foot)))
+        if max(abs(turn.miss), tilt) < _TURN_TOLERANCE and off < _SHIFT_TOLERANCE:
             found.append((k, k + 1))
     return np.array(found, dtype=np.intp).reshape(-1, 2)
 
