@@ -15,8 +15,6 @@ from handeye_tri.errors import InputError
 Floats = NDArray[np.float64]
 
 PROGRAMME_SCHEMA = "handeye_tri.programme/1"
-# Speed of a joint whose model gives none, rad/s or m/s.
-_UNKNOWN_SPEED = 1.0
 # Radius within which a URScript move may cut the corner at a point it passes, metres.
 _BLEND = 0.01
 
@@ -34,7 +32,7 @@ class Programme:
         kinds: "calibration" or "evaluation", by station.
         via: Joints passed on the way to each station, shapes (k, q), straight in
             joint space from one to the next; k is 0 where the way is straight.
-        speed: Speed limits, shape (q,), rad/s or m/s; inf where unknown.
+        speed: Speed limits, shape (q,), rad/s or m/s.
         acceleration_time: From rest to full speed, seconds.
         dwell: How long the robot stands at a station, seconds.
     """
@@ -56,10 +54,9 @@ class Programme:
             raise InputError(f"dwell must be 0 s or longer, got {self.dwell}")
 
     @property
-    def limits(self) -> tuple[Floats, Floats]:
-        """Speed and acceleration limits by joint, shapes (q,)."""
-        speed = np.where(np.isfinite(self.speed), self.speed, _UNKNOWN_SPEED)
-        return speed, speed / self.acceleration_time
+    def acceleration(self) -> Floats:
+        """Acceleration limits, shape (q,), rad/s^2 or m/s^2."""
+        return self.speed / self.acceleration_time
 
     def leg(self, station: int) -> Floats:
         """Where the way to a station leads, from the stop before, shape (k + 2, q)."""
@@ -107,7 +104,7 @@ def joint_trajectory_yaml(programme: Programme) -> str:
         "points:",
         *_point(programme.home, 0.0),
     ]
-    speed, acceleration = programme.limits
+    speed, acceleration = programme.speed, programme.acceleration
     now = 0.0
     for k in range(len(programme.stops)):
         leg = programme.leg(k)
@@ -149,7 +146,7 @@ def urscript(programme: Programme) -> str:
             "urscript needs an arm of six hinges, got "
             f"{', '.join(programme.joint_names)}; choose csv, json or joint_trajectory"
         )
-    speed, acceleration = programme.limits
+    speed, acceleration = programme.speed, programme.acceleration
     lines = [f"# {line}" for line in programme.head]
     lines += ["# Joints in rad, base to wrist.", "def calibration_programme():"]
     start = _joints(programme.home)

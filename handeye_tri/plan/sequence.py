@@ -34,10 +34,10 @@ def travel_time(
     Args:
         start: Shape (..., q), rad or m.
         end: Shape (..., q), rad or m.
-        speed: Shape (q,), rad/s or m/s; 1 where infinite (unknown).
+        speed: Shape (q,), rad/s or m/s.
         acceleration_time: From rest to full speed, seconds.
     """
-    cruise = np.abs(end - start) / np.where(np.isfinite(speed), speed, 1.0)
+    cruise = np.abs(end - start) / speed
     short = 2 * np.sqrt(cruise * acceleration_time)
     full = cruise + acceleration_time
     times = np.where(cruise >= acceleration_time, full, short)

@@ -112,10 +112,3 @@ def test_urscript_is_for_six_hinges():
 def test_dwell_must_be_a_time(dwell):
     with pytest.raises(InputError, match="dwell must be 0 s or longer"):
         replace(PROGRAMME, dwell=dwell)
-
-
-def test_joints_without_a_stated_speed_are_driven_slowly():
-    text = joint_trajectory_yaml(replace(PROGRAMME, speed=np.full(6, np.inf)))
-    slow = YAML(typ="safe").load(text)["points"][-1]["time_from_start"]["sec"]
-    quick = YAML(typ="safe").load(joint_trajectory_yaml(PROGRAMME))
-    assert slow > quick["points"][-1]["time_from_start"]["sec"]
