@@ -81,19 +81,26 @@ class CandidateSearch:
         drawn: Poses drawn.
     """
 
-    def __init__(self, view: View, arm: Arm, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        view: View,
+        arm: Arm,
+        rng: np.random.Generator,
+        rejected: Counter[str] | None = None,
+    ) -> None:
         """Start a search.
 
         Args:
             view: Cameras and rig.
             arm: The robot in its cell.
             rng: What poses are drawn from.
+            rejected: Counts on from there.
         """
         self._view = view
         self._arm = arm
         self._rng = rng
         self._anchor = arm.home
-        self.rejected: Counter[str] = Counter()
+        self.rejected: Counter[str] = Counter() if rejected is None else rejected
         self.drawn = 0
 
     def find(self, wanted: int, *, turns: bool) -> list[Candidate]:

@@ -17,6 +17,7 @@ from handeye_tri.plan.certificate import MIN_AXIS_SPREAD, certify
 from handeye_tri.plan.design import Design
 from handeye_tri.plan.information import EXPECTED_SIGMA_PX, StationInformation
 from handeye_tri.plan.poses import View, plane_angles
+from handeye_tri.plan.refusal import no_plan
 from handeye_tri.plan.route import RoutePlanner
 from handeye_tri.plan.selection import Selector
 from handeye_tri.plan.sequence import Stops
@@ -34,23 +35,6 @@ _SELECTIONS = 6
 # Ways to reach a half-turn that the order may choose from, senses included.
 _OPTIONS = 12
 
-_REMEDY = {
-    "tilt": "raise plan.max_tilt_deg or bring the cameras closer together",
-    "image": "turn the cameras to the workspace box, or move plan.workspace_min_m "
-    "and workspace_max_m to where all cameras see the rig",
-    "reach": "move the workspace box or the cameras nearer to the robot",
-    "limits": "move the workspace box to where the joint limits leave room",
-    "half_turn": "the wrist cannot turn by 180 degrees there: use an arm or an edge "
-    "rig whose last joint can",
-    "collision": "give the arm room: move what stands in the cell or the workspace box",
-    "occlusion": "uncover the markers: move the cameras, what stands between, or the "
-    "rig farther ahead of the flange",
-    "turn_path": "give the turning rig room: move what stands in the cell",
-    "plane_spread": "lower plan.min_plane_spread_deg or raise plan.max_tilt_deg",
-    "path": "give the arm room between stations: move what stands in the cell",
-    "axis_spread": "raise plan.max_tilt_deg: the stations hardly turn against another",
-}
-
 
 def plan_motions(
     cell: Cell,
@@ -62,14 +46,14 @@ def plan_motions(
     """Plan half-turns joined by general motions, then evaluation stations.
 
     Every station is within the joint limits, free of collision with clearance, and
-    shows all markers' outlines unhidden and with margin in every camera's image, at
-    an allowed tilt; the two stations of a half-turn differ by 180 degrees about the
+    shows all markers' outlines unhidden and with margin to two cameras or more, at an
+    allowed tilt; the two stations of a half-turn differ by 180 degrees about the
     flange's z axis; successive half-turns' planes enclose at least
     ``plan.min_plane_spread_deg`` (Zhao, Liu and Zhang 2008, Proposition 1,
-    doi:10.1109/TIP.2008.2005562); straight joint paths from station to station are
-    free. Among what passes, those half-turns are chosen that make the
-    calibration's part of the predicted track error over the workspace box least,
-    and the order that takes the least time.
+    doi:10.1109/TIP.2008.2005562); ways from station to station are free, straight in
+    joint space or past the points in ``via``. Among what passes, those half-turns
+    are chosen that make the calibration's part of the predicted track error over the
+    workspace box least, and the order that takes the least time.
 
     The certificate holds what :func:`~handeye_tri.plan.certificate.certify` predicts
     from the stations, and
@@ -194,12 +178,9 @@ class _Planner:
 
     def plan(self) -> Plan:
         """Search, choose, order, and add the evaluation stations."""
-        search = CandidateSearch(
-            self.view, self.arm, np.random.default_rng([self.seed, 0])
-        )
+        search = self._search(0)
         # Half of the work is in what comes after the pool.
         pool = search.prospects(self.pool_size, progress=lambda n: self._done(n // 2))
-        self.rejected = self.route.rejected = search.rejected
         if len(pool) < self.wanted:
             raise self._no_plan(
                 search.drawn, f"{len(pool)} of {self.wanted} half-turns found"
@@ -210,6 +191,10 @@ class _Planner:
         plan = self._record(chosen, evaluation, [*via, *further], bound, len(pool))
         self._done(self.total)
         return plan
+
+    def _search(self, stream: int) -> CandidateSearch:
+        rng = np.random.default_rng([self.seed, stream])
+        return CandidateSearch(self.view, self.arm, rng, self.rejected)
 
     def _choose_and_order(
         self, pool: Sequence[Prospect], search: CandidateSearch
@@ -274,8 +259,8 @@ class _Planner:
     ) -> tuple[list[Candidate], list[Floats]] | int:
         """The half-turns in the order of least time, or the one that is in the way.
 
-        Planes of successive half-turns spread enough, and the straight path
-        between them is free; each is driven in one of its two senses.
+        Planes of successive half-turns spread enough, and the way between them is
+        free; each is driven in one of its two senses.
 
         Args:
             ways: Free solutions of each half-turn.
@@ -313,13 +298,9 @@ class _Planner:
         wanted = self.held_out
         if wanted == 0:
             return [], []
-        search = CandidateSearch(
-            self.view, self.arm, np.random.default_rng([self.seed, 1])
-        )
+        search = self._search(1)
         # Some more than wanted: the way to one may be blocked.
         found = search.find(2 * wanted, turns=False)
-        self.rejected += search.rejected
-        self.route.rejected = self.rejected
         while len(found) >= wanted:
             joints = np.array([c.joints[0] for c in found[:wanted]])
             times = self.route.time(joints[:, None], joints[None])
@@ -399,11 +380,4 @@ class _Planner:
         return (*turns, *ways[half_turns:])
 
     def _no_plan(self, drawn: int, what: str, check: str | None = None) -> NoPlanError:
-        counts = {name: n for name, n in self.rejected.most_common() if n}
-        most = check or next(iter(counts), "reach")
-        listed = ", ".join(f"{name} {n}" for name, n in counts.items()) or "none"
-        return NoPlanError(
-            f"no plan for cell {self.cell.name!r}: {what} among {drawn} candidates; "
-            f"rejected by check: {listed}. Do: {_REMEDY[most]}",
-            counts,
-        )
+        return no_plan(self.cell.name, self.rejected, drawn, what, check)
