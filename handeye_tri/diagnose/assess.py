@@ -85,6 +85,8 @@ def assess(
         "; ".join(str(one) for one in dropped),
         "warning",
         "look at those images, and repeat those half-turns where they are needed",
+        tuple(sorted({j for one in dropped for j in (one.before, one.after)})),
+        dropped[0].camera if len({one.camera for one in dropped}) == 1 else "",
     )
     return replace(verdict, findings=(*verdict.findings, finding))
 

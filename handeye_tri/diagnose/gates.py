@@ -57,6 +57,8 @@ class Finding:
         evidence: The numbers.
         severity: "note", "warning" or "error".
         remedy: What to do.
+        stations: Indices of the stations that it is about; none where it is about all.
+        camera: Name of the camera that it is about; "" where it is about all.
     """
 
     code: str
@@ -64,6 +66,8 @@ class Finding:
     evidence: str
     severity: Literal["note", "warning", "error"]
     remedy: str
+    stations: tuple[int, ...] = ()
+    camera: str = ""
 
 
 @dataclass(frozen=True, slots=True)

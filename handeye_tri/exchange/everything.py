@@ -89,7 +89,13 @@ def _definitions() -> Json:
         "half_turn": half_turn,
         "gate": _object({key: _TEXT for key in ("name", "found", "limit", "verdict")}),
         "finding": _object(
-            {key: _TEXT for key in ("code", "cause", "evidence", "severity", "remedy")}
+            {
+                **{key: _TEXT for key in ("code", "cause", "evidence", "severity")},
+                "remedy": _TEXT,
+                "stations": {"type": "array", "items": {"type": "integer"}},
+                "camera": _TEXT,
+            },
+            ("stations", "camera"),
         ),
     }
 

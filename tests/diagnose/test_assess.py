@@ -77,6 +77,8 @@ def test_a_bad_half_turn_is_left_out_and_named(cameras, jointly):
     assert verdict.outcome == "PASS", codes(verdict)
     assert codes(verdict) == {"DROPPED"}
     (finding,) = verdict.findings
+    assert finding.stations == (turn.before, turn.after)
+    assert finding.camera == ("" if len(cameras) > 1 else session.cameras[1].name)
     for i in cameras:
         name = session.cameras[i].name
         assert f"{name}, half-turn 4 (stations {turn.before}" in finding.evidence
