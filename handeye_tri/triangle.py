@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handeye_tri.errors import InputError
-from handeye_tri.se3 import SE3
+from handeye_tri.se3 import SE3, hat
 
 Floats = NDArray[np.float64]
 Axis = Literal["normal", "AB", "BC", "CA"]
@@ -165,3 +165,27 @@ class TriangleRig:
         start, end, apex = self.points[[first, second, third], :2]
         along = (end - start) / np.linalg.norm(end - start)
         return np.asarray(start + along * ((apex - start) @ along))
+
+
+def triangle_frame(markers: Floats) -> SE3:
+    """flange_from_triangle of markers A, B, C in the flange, shape (3, 3), metres."""
+    along, toward = markers[1] - markers[0], markers[2] - markers[0]
+    x = along / np.linalg.norm(along)
+    z = np.cross(x, toward)
+    z /= np.linalg.norm(z)
+    return SE3.from_parts(np.stack([x, np.cross(z, x), z], axis=1), markers[0])
+
+
+def frame_by_markers(markers: Floats) -> Floats:
+    """Derivative of the right tangent of the triangle's frame by A, B, C, (6, 9).
+
+    A marker P in the triangle's frame moves in the flange by R (dt + dr x P + dP),
+    where dP is along x for B, in the plane for C: nine numbers for nine.
+    """
+    frame = triangle_frame(markers)
+    points = frame.inverse().apply(markers)
+    by_frame = np.zeros((3, 3, 9))
+    by_frame[..., :3], by_frame[..., 3:6] = np.eye(3), -hat(points)
+    by_frame[1, 0, 6] = by_frame[2, 0, 7] = by_frame[2, 1, 8] = 1.0
+    by_shape = (frame.rotation @ by_frame).reshape(9, 9)
+    return np.asarray(np.linalg.inv(by_shape)[:6])

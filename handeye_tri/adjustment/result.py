@@ -22,6 +22,7 @@ from handeye_tri.records import (
     motion_labels,
 )
 from handeye_tri.se3 import SE3, hat
+from handeye_tri.triangle import frame_by_markers, triangle_frame
 
 Floats = NDArray[np.float64]
 
@@ -170,30 +171,6 @@ def _chi2_parts(model: AdjustmentModel, state: State, cost: float) -> dict[str, 
     return {"chi2_pixels": cost - sum(parts.values()), **parts}
 
 
-def triangle_frame(markers: Floats) -> SE3:
-    """flange_from_triangle of markers A, B, C in the flange, shape (3, 3), metres."""
-    along, toward = markers[1] - markers[0], markers[2] - markers[0]
-    x = along / np.linalg.norm(along)
-    z = np.cross(x, toward)
-    z /= np.linalg.norm(z)
-    return SE3.from_parts(np.stack([x, np.cross(z, x), z], axis=1), markers[0])
-
-
-def _frame_by_markers(markers: Floats) -> Floats:
-    """Derivative of the right tangent of the triangle's frame by A, B, C, (6, 9).
-
-    A marker P in the triangle's frame moves in the flange by R (dt + dr x P + dP),
-    where dP is along x for B, in the plane for C: nine numbers for nine.
-    """
-    frame = triangle_frame(markers)
-    points = frame.inverse().apply(markers)
-    by_frame = np.zeros((3, 3, 9))
-    by_frame[..., :3], by_frame[..., 3:6] = np.eye(3), -hat(points)
-    by_frame[1, 0, 6] = by_frame[2, 0, 7] = by_frame[2, 1, 8] = 1.0
-    by_shape = (frame.rotation @ by_frame).reshape(9, 9)
-    return np.asarray(np.linalg.inv(by_shape)[:6])
-
-
 def _derived(
     model: AdjustmentModel, state: State, cameras: Sequence[PinholeCamera]
 ) -> tuple[tuple[str, ...], Floats]:
@@ -224,7 +201,7 @@ def _derived(
         )
         by_markers = by_rig.reshape(9, 6) @ by_markers
     labels += [*motion_labels("flange_from_triangle"), *MARKER_LABELS]
-    rows += [_frame_by_markers(state.markers) @ by_markers, by_markers]
+    rows += [frame_by_markers(state.markers) @ by_markers, by_markers]
     if model.robot is not None:
         labels += model.robot.labels
         rows.append(eye[model.rig.stop :])

@@ -294,6 +294,9 @@ class PlanConfig(MotionConfig):
     evaluation_stations: Annotated[int, Field(strict=True, ge=0)] = 6
     max_tilt_deg: Annotated[Number, Field(gt=0, lt=90)] = 55.0
     image_margin_px: NotNegative = 20.0
+    expected_sigma_px: Positive = Field(
+        0.03, description="detection error per axis that predictions assume"
+    )
     workspace_min_m: Point
     workspace_max_m: Point
 

@@ -13,6 +13,7 @@ from handeye_tri.config import Cell
 from handeye_tri.plan.design import Design
 from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import HALF_TURN, View, plane_angles
+from handeye_tri.records import motion_labels
 from handeye_tri.se3 import so3_log
 
 Floats = NDArray[np.float64]
@@ -69,8 +70,9 @@ def certify(
       of the information, scaled to unit diagonal,
     * ``sigma.<camera>.fx_px`` (``fy_px skew_px cx_px cy_px``, lens by name),
       ``sigma.baseline_mm`` (of the first two cameras),
-      ``sigma.base_from_<camera>.translation_mm`` and ``.rotation_deg``: predicted
-      standard deviations (for motions: of the three axes together),
+      ``sigma.base_from_<camera>.translation_mm`` and ``.rotation_deg``, and the same of
+      ``flange_from_triangle``: predicted standard deviations (for motions: of the
+      three axes together),
     * ``track_calibration_rms_mm``: the calibration's part of the predicted distance
       between reported and observed markers, over the workspace box,
     * ``track_predicted_rms_mm``: the same with the noise of a new view and of the
@@ -100,18 +102,19 @@ def certify(
         "unknowns": float(len(values)),
         "condition": _condition(values),
     }
-    for label in covariance.labels:
-        owner, quantity = label.rsplit(".", 1)
-        if "_from_" not in owner:
-            unit = "_px" if quantity in _PIXELS else ""
-            numbers[f"sigma.{label}{unit}"] = covariance.std(label)
+    for camera in cell.cameras:
+        for label in covariance.labels:
+            owner, quantity = label.rsplit(".", 1)
+            if owner == camera.name:
+                unit = "_px" if quantity in _PIXELS else ""
+                numbers[f"sigma.{label}{unit}"] = covariance.std(label)
     for camera in cell.cameras:
         name = f"base_from_{camera.name}"
-        sigma = np.array([covariance.std(f"{name}.{q}") for q in "xyz"])
-        turn = np.array([covariance.std(f"{name}.r{q}") for q in "xyz"])
-        numbers[f"sigma.{name}.translation_mm"] = float(1e3 * np.linalg.norm(sigma))
-        numbers[f"sigma.{name}.rotation_deg"] = float(np.degrees(np.linalg.norm(turn)))
-    numbers["sigma.baseline_mm"] = 1e3 * model.baseline_sigma(covariance)
+        numbers |= _of_motion(name, covariance.block(motion_labels(name)))
+    rig = model.rig_covariance(covariance)
+    numbers |= _of_motion("flange_from_triangle", rig)
+    if len(cell.cameras) > 1:
+        numbers["sigma.baseline_mm"] = 1e3 * model.baseline_sigma(covariance)
     caused = float((model.workspace_cost * covariance.matrix).sum())
     numbers["track_calibration_rms_mm"] = float(1e3 * np.sqrt(caused))
     numbers["track_predicted_rms_mm"] = float(
@@ -127,6 +130,15 @@ def certify(
     if findings:
         outcome = "CANNOT TELL" if cannot else "FAIL"
     return Certificate(numbers, outcome, tuple(findings))
+
+
+def _of_motion(name: str, covariance: Floats) -> dict[str, float]:
+    """Sigmas of a motion from the covariance (6, 6) of its right tangent."""
+    sigma = np.sqrt(np.diag(covariance).reshape(2, 3).sum(axis=1))
+    return {
+        f"sigma.{name}.translation_mm": float(1e3 * sigma[0]),
+        f"sigma.{name}.rotation_deg": float(np.degrees(sigma[1])),
+    }
 
 
 def _scaled_spectrum(information: Floats) -> tuple[Floats, Floats]:

@@ -1,10 +1,10 @@
 """What stations tell about the cell: Fisher information, before any image exists.
 
-Model: every camera's intrinsics and lens, every camera in the base, and the rig on
-the flange are unknown; each station's pose differs from the reported one by the
-robot's repeatability, which is eliminated station by station. The information of
-stations adds up, and the inverse of its sum is the Cramer-Rao bound of an
-adjustment that uses the pixels of all stations together.
+Model: every camera's intrinsics and lens, every camera in the base, and the three
+markers in the flange frame are unknown; each station's pose differs from the reported
+one by the robot's repeatability, which is eliminated station by station. The
+information of stations adds up, and the inverse of its sum is the Cramer-Rao bound of
+the joint adjustment, which solves this very model.
 """
 
 from __future__ import annotations
@@ -16,14 +16,18 @@ from numpy.typing import NDArray
 
 from handeye_tri.camera import INTRINSIC_NAMES
 from handeye_tri.plan.poses import View
-from handeye_tri.records import Covariance, Repeatability, motion_labels
+from handeye_tri.records import (
+    MARKER_LABELS,
+    Covariance,
+    Repeatability,
+    motion_labels,
+)
 from handeye_tri.se3 import hat, se3_inverse
+from handeye_tri.triangle import frame_by_markers
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# Detection's standard deviation per axis that predictions assume, pixels.
-EXPECTED_SIGMA_PX = 0.03
 # Prior standard deviations that keep a few stations solvable; far wider than what
 # two half-turns give: pixels for intrinsics, bare numbers for the lens, m and rad.
 _PRIOR_PIXELS = 1000.0
@@ -86,10 +90,15 @@ class StationInformation:
             self._columns.append((slice(begin, len(labels)), chosen, lens))
             prior += [_PRIOR_PIXELS] * len(chosen) + [_PRIOR_LENS] * len(lens)
             prior += [_PRIOR_MOTION] * 6
-        labels += motion_labels("flange_from_triangle")
-        prior += [_PRIOR_MOTION] * 6
+        labels += MARKER_LABELS
+        prior += [_PRIOR_MOTION] * 9
         self.labels = tuple(labels)
         self.prior = np.diag(1.0 / np.square(prior))
+
+    def _marker(self, k: int) -> slice:
+        """Columns of marker k, which come last."""
+        begin = len(self.labels) - 9 + 3 * k
+        return slice(begin, begin + 3)
 
     def _derivatives(
         self, base_from_flange: Floats, seen: Flags
@@ -108,7 +117,6 @@ class StationInformation:
         by_unknowns = np.zeros((n, m, 3, 2, p))
         by_error = np.zeros((n, m, 3, 2, 6))
         by_base_point = np.zeros((n, m, 3, 2, 3))
-        triangle = view.cell.rig.triangle.points
         for i, camera in enumerate(view.cameras):
             camera_from_flange = self._camera_from_base[i] @ base_from_flange
             rotation = camera_from_flange[:, None, :3, :3]
@@ -125,10 +133,8 @@ class StationInformation:
             by_error[:, i] = np.concatenate(
                 [by_flange, -by_flange @ hat(view.markers)], axis=-1
             )
-            by_triangle = by_flange @ view.flange_from_triangle.rotation
-            by_unknowns[:, i, :, :, -6:] = np.concatenate(
-                [by_triangle, -by_triangle @ hat(triangle)], axis=-1
-            )
+            for k in range(3):
+                by_unknowns[:, i, k, :, self._marker(k)] = by_flange[:, k]
             by_base_point[:, i] = by_point @ self._camera_from_base[i, :3, :3]
         for result in (by_unknowns, by_error, by_base_point):
             result[~seen] = 0.0
@@ -170,7 +176,7 @@ class StationInformation:
         return np.asarray(each.reshape(-1, 2, size, size).sum(axis=1))
 
     @cached_property
-    def _places(self) -> tuple[Floats, Flags]:
+    def places(self) -> tuple[Floats, Flags]:
         """Flange poses in the workspace box, (n, 4, 4), and who sees them, (n, m)."""
         world = self.view.draw(np.random.default_rng(0), _DRAWN_PLACES)
         seen = self.view.seen(world)
@@ -185,22 +191,27 @@ class StationInformation:
         reported and observed markers that the calibration causes, in m^2, over
         poses in the workspace box that enough cameras see.
         """
-        track = self.track_derivatives(*self._places).reshape(-1, len(self.labels))
+        track = self.track_derivatives(*self.places).reshape(-1, len(self.labels))
         return np.asarray(track.T @ track / (len(track) / 3))
 
     @cached_property
     def workspace_noise(self) -> float:
         """Mean squared distance there from a new view's and the robot's noise, m^2."""
-        _, _, by_point = self._derivatives(*self._places)
-        normal = np.einsum("nikac,nikad->nkcd", by_point, by_point)
-        seen = self.sigma_px**2 * np.trace(np.linalg.inv(normal), axis1=2, axis2=3)
-        lever = np.concatenate(
-            [np.broadcast_to(np.eye(3), (3, 3, 3)), -hat(self.view.markers)], axis=2
+        poses, seen = self.places
+        noise = self.sigma_px**2 * self._observed(poses, seen)[1]
+        lever = self._lever
+        robot = lever @ self._pose_covariance @ lever.swapaxes(1, 2)
+        return float(
+            np.trace(noise, axis1=2, axis2=3).mean()
+            + np.trace(robot, axis1=1, axis2=2).mean()
         )
-        robot = np.trace(
-            lever @ self._pose_covariance @ lever.swapaxes(1, 2), axis1=1, axis2=2
-        )
-        return float(seen.mean() + robot.mean())
+
+    @property
+    def _lever(self) -> Floats:
+        """Markers in the flange by the flange's right tangent, shape (3, 3, 6)."""
+        markers = self.view.markers
+        eye = np.broadcast_to(np.eye(3), (3, 3, 3))
+        return np.concatenate([eye, -hat(markers)], axis=2)
 
     def baseline_sigma(self, covariance: Covariance) -> float:
         """Predicted sigma of the distance of the first two cameras, metres."""
@@ -219,33 +230,57 @@ class StationInformation:
     def track_derivatives(self, base_from_flange: Floats, seen: Flags) -> Floats:
         """Observed less reported marker positions by the unknowns.
 
-        Observed: triangulated from fixed pixels with equal weights. Reported: the
-        robot's pose applied to the markers on the flange.
+        Observed: from fixed pixels with equal weights, each marker triangulated; a
+        cell's only camera sees where the rigid triangle is. Reported: the robot's pose
+        applied to the markers on the flange.
 
         Args:
             base_from_flange: Shape (n, 4, 4), metres.
-            seen: Which cameras place the markers, shape (n, m), two or more each.
+            seen: Which cameras place the markers, shape (n, m), two or more each, or
+                the only one.
 
         Returns:
             Shape (n, 3, 3, p): station, marker, axis in base.
         """
-        by_unknowns, _, by_point = self._derivatives(base_from_flange, seen)
-        triangle = self.view.cell.rig.triangle.points
-        # The triangle's own columns do not move what the cameras observe.
-        by_cameras = by_unknowns.copy()
-        by_cameras[..., -6:] = 0.0
-        normal = np.einsum("nikac,nikad->nkcd", by_point, by_point)
-        pull = np.einsum("nikac,nikap->nkcp", by_point, by_cameras)
-        result = -np.linalg.solve(normal, pull)
-        rotation = base_from_flange[:, None, :3, :3]
-        rotation = rotation @ self.view.flange_from_triangle.rotation
-        result[..., -6:-3] -= rotation
-        result[..., -3:] += rotation @ hat(triangle)
-        return np.asarray(result)
+        result = self._observed(base_from_flange, seen)[0]
+        for k in range(3):
+            result[:, k, :, self._marker(k)] -= base_from_flange[:, :3, :3]
+        return result
+
+    def _observed(self, base_from_flange: Floats, seen: Flags) -> tuple[Floats, Floats]:
+        """Observed markers by the unknowns, and their covariance at 1 px.
+
+        Returns:
+            Shapes (n, 3, 3, p) and (n, 3, 3, 3), in the base.
+        """
+        by_unknowns, by_error, by_point = self._derivatives(base_from_flange, seen)
+        if len(self.view.cameras) > 1:
+            # The triangle does not move what the cameras observe.
+            by_unknowns[..., -9:] = 0.0
+            normal = np.einsum("nikac,nikad->nkcd", by_point, by_point)
+            pull = np.einsum("nikac,nikap->nkcp", by_point, by_unknowns)
+            return -np.linalg.solve(normal, pull), np.linalg.inv(normal)
+        # Six coordinates for six of a pose.
+        pose = np.linalg.inv(by_error.reshape(-1, 6, 6))
+        moved = base_from_flange[:, None, :3, :3] @ self._lever
+        by_pixels = moved @ pose[:, None]
+        result = -by_pixels @ by_unknowns.reshape(len(pose), 1, 6, -1)
+        for k in range(3):
+            result[:, k, :, self._marker(k)] += base_from_flange[:, :3, :3]
+        return result, by_pixels @ by_pixels.swapaxes(-1, -2)
 
     def covariance(self, information: Floats) -> Covariance:
         """Predicted covariance of the unknowns from summed information, (p, p)."""
         return Covariance(self.labels, _inverse(information + self.prior))
+
+    def rig_covariance(self, covariance: Covariance) -> Floats:
+        """That of flange_from_triangle's right tangent, shape (6, 6), m and rad.
+
+        Args:
+            covariance: Of the unknowns.
+        """
+        by_markers = frame_by_markers(self.view.markers)
+        return np.asarray(by_markers @ covariance.block(MARKER_LABELS) @ by_markers.T)
 
 
 def _inverse(information: Floats) -> Floats:

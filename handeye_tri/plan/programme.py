@@ -15,7 +15,7 @@ from handeye_tri.errors import InputError, NoPlanError
 from handeye_tri.plan.candidates import Candidate, CandidateSearch, Prospect
 from handeye_tri.plan.certificate import MIN_AXIS_SPREAD, certify
 from handeye_tri.plan.design import Design
-from handeye_tri.plan.information import EXPECTED_SIGMA_PX, StationInformation
+from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import View, plane_angles
 from handeye_tri.plan.refusal import no_plan
 from handeye_tri.plan.route import RoutePlanner
@@ -160,7 +160,7 @@ class _Planner:
             self.view,
             arm.base_from_world.matrix,
             cell.repeatability,
-            EXPECTED_SIGMA_PX,
+            cell.plan.expected_sigma_px,
         )
         self.pool_size = min(_POOL * wanted, _LARGEST_POOL)
         self.total = self.pool_size + wanted + self.held_out

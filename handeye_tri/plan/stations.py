@@ -13,7 +13,7 @@ from handeye_tri.errors import InputError
 from handeye_tri.exchange.half_turns import turn_between
 from handeye_tri.plan.candidates import SIGHT_MARGIN
 from handeye_tri.plan.certificate import certify
-from handeye_tri.plan.information import EXPECTED_SIGMA_PX, StationInformation
+from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import View
 from handeye_tri.plan.sequence import travel_time
 from handeye_tri.records import HalfTurn, Plan, Station
@@ -61,7 +61,9 @@ def certify_stations(cell: Cell, arm: Arm, joints: ArrayLike) -> Plan:
     turns = _half_turns(poses)
     view = View(cell)
     base = arm.base_from_world.matrix
-    model = StationInformation(view, base, cell.repeatability, EXPECTED_SIGMA_PX)
+    model = StationInformation(
+        view, base, cell.repeatability, cell.plan.expected_sigma_px
+    )
     seen = view.seen(arm.base_from_world.inverse().matrix @ poses)
     forbidden = _forbidden(arm, view, q, seen)
     certificate = certify(cell, model, poses, seen, turns)

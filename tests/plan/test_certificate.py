@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import planning_scene as scene
 import pytest
+import simulated_calibrations as simulated
 
 from handeye_tri.plan.certificate import axis_spread, certify
 from handeye_tri.plan.information import StationInformation
@@ -58,7 +59,7 @@ def test_stations_that_only_shift_leave_most_unknown():
     text = " ".join(certificate.findings)
     assert "do not determine" in text
     assert "base_from_" in text
-    assert "(rank 25 of 28)" in text
+    assert "(rank 28 of 31)" in text
     assert "0 half-turns" in text
     assert "Do: add a half-turn" in certificate.findings[-1]
 
@@ -144,6 +145,30 @@ def test_baseline_sigma_is_that_of_drawn_cameras():
     ]
     lengths = np.linalg.norm(moved[0][:, :3, 3] - moved[1][:, :3, 3], axis=1)
     assert model.baseline_sigma(covariance) == pytest.approx(lengths.std(), rel=0.05)
+
+
+def test_predicted_sigmas_are_those_of_simulated_adjustments():
+    """60 runs know a sigma to 9 %; a block's pool to 3 to 6 %."""
+    cell, model = scene.cell_of("hp3_stereo"), model_of()
+    plan = scene.plan_of("hp3_stereo")
+    stations = simulated.planned_stations(plan)
+    errors = []
+    for run in range(60):
+        rng = np.random.default_rng([6, run])
+        session, truth = simulated.simulated(
+            cell, model, stations, plan.half_turns, rng
+        )
+        test = simulated.workspace_test(cell, model, rng)
+        found = simulated.from_truth(session, truth)
+        errors.append(simulated.squared_errors(found, truth, test))
+    quantities = simulated.by_quantity(errors, plan.certificate)
+    assert len(quantities) == 19
+    for name, squares in quantities.items():
+        ratio = simulated.ratio(squares)
+        assert ratio.value == pytest.approx(1, abs=0.1 + 3 * ratio.error), name
+    for name, squares in simulated.by_block(quantities).items():
+        ratio = simulated.ratio(squares)
+        assert ratio.value == pytest.approx(1, abs=0.02 + 3 * ratio.error), name
 
 
 def test_axis_spread_of_known_rotations():

@@ -7,6 +7,7 @@ import pytest
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera, triangulate
 from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import View
+from handeye_tri.records import MARKER_LABELS
 from handeye_tri.se3 import SE3, se3_exp, se3_inverse
 
 SIGMA = 0.05
@@ -34,7 +35,7 @@ class Predicted:
         self.seen = np.ones((len(poses), len(self.view.cameras)), dtype=bool)
 
     def deviated(self, delta):
-        """Cameras, base_from_camera and flange_from_triangle, off by delta (p,)."""
+        """Cameras, base_from_camera and markers (3, 3), off by delta (p,)."""
         value = dict(zip(self.model.labels, delta, strict=True))
         cameras, motions = [], []
         for i, camera in enumerate(self.view.cameras):
@@ -53,20 +54,15 @@ class Predicted:
             )  # fmt: skip
             nominal = self.base_from_world @ self.view.world_from_camera[i]
             motions.append(nominal @ se3_exp(self._tangent(value, f"base_from_{n}")))
-        rig = self.view.flange_from_triangle.matrix
-        return (
-            cameras,
-            motions,
-            rig @ se3_exp(self._tangent(value, "flange_from_triangle")),
-        )
+        off = np.array([value[label] for label in MARKER_LABELS]).reshape(3, 3)
+        return cameras, motions, self.view.markers + off
 
     @staticmethod
     def _tangent(value, name):
         return [value[f"{name}.{q}"] for q in ("x", "y", "z", "rx", "ry", "rz")]
 
-    def markers(self, rig, error=NO_ERROR):
+    def markers(self, points, error=NO_ERROR):
         """In the base, shape (n, 3, 3)."""
-        points = self.cell.rig.triangle.points @ rig[:3, :3].T + rig[:3, 3]
         poses = self.poses @ se3_exp(error)
         turned = points @ poses[:, :3, :3].swapaxes(1, 2)
         return turned + poses[:, None, :3, 3]
