@@ -2,10 +2,9 @@
 
 The calibration's part of the predicted track error is compared with the bound on
 every choice among the plan's candidates, and with random plans: as many half-turns
-as planned, drawn without replacement from the first feasible ones of
-``CandidateSearch.find``, whose poses are uniform in the workspace box, in tilt and
-in spin. The time of all moves is compared with that of the same stations with the
-half-turns in random order.
+as planned, by the sampler ``RandomPlans`` in tests/plan/random_plans.py. The time of
+all moves is compared with that of the same stations with the half-turns in random
+order.
 
 Example: python scripts/check_planning.py --seeds 50 --random 200
 """
@@ -13,55 +12,26 @@ Example: python scripts/check_planning.py --seeds 50 --random 200
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from handeye_tri.arm import Arm
-from handeye_tri.config import Cell
-from handeye_tri.errors import NoPlanError
-from handeye_tri.plan import plan_motions
-from handeye_tri.plan.candidates import CandidateSearch
-from handeye_tri.plan.design import Design
-from handeye_tri.plan.information import StationInformation
-from handeye_tri.plan.poses import View
-from handeye_tri.plan.sequence import travel_time
-from handeye_tri.records import Plan
-from handeye_tri.simulate import compile_mechanism
-from handeye_tri.storage.cells import read_cell
+REPO = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(REPO / "tests" / "plan"))
 
-REPO = Path(__file__).resolve().parent.parent
+from random_plans import RandomPlans  # noqa: E402
+from simulated_calibrations import predictions  # noqa: E402
 
-
-# Feasible half-turns that random plans are drawn from.
-_FEASIBLE = 250
-
-
-def random_plans(
-    cell: Cell, arm: Arm, half_turns: int, count: int, sigma_px: float
-) -> NDArray[np.float64]:
-    """Calibration's part of the track error of random plans, mm, shape (count,)."""
-    view, rng = View(cell), np.random.default_rng(1)
-    found = CandidateSearch(view, arm, rng).find(_FEASIBLE, turns=True)
-    model = StationInformation(
-        view, arm.base_from_world.matrix, cell.repeatability, sigma_px
-    )
-    design = Design(
-        model.of_half_turns(
-            np.array([c.base_from_flange for c in found]),
-            np.array([c.seen for c in found]),
-        ),
-        model.prior,
-        model.workspace_cost,
-    )
-    errors = []
-    for _ in range(count):
-        weights = np.zeros(len(found))
-        weights[rng.choice(len(found), half_turns, replace=False)] = 1.0
-        errors.append(1e3 * np.sqrt(design.cost(weights)))
-    return np.array(errors)
+from handeye_tri.arm import Arm  # noqa: E402
+from handeye_tri.config import Cell  # noqa: E402
+from handeye_tri.errors import NoPlanError  # noqa: E402
+from handeye_tri.plan import plan_motions  # noqa: E402
+from handeye_tri.plan.sequence import travel_time  # noqa: E402
+from handeye_tri.records import Plan  # noqa: E402
+from handeye_tri.simulate import compile_mechanism  # noqa: E402
+from handeye_tri.storage.cells import read_cell  # noqa: E402
 
 
 def random_order_time(cell: Cell, arm: Arm, plan: Plan) -> float:
@@ -112,10 +82,10 @@ def main() -> None:
         track = np.array([c["track_calibration_rms_mm"] for c in numbers])
         bound = np.array([c["relaxed_bound_mm"] for c in numbers])
         cycle = np.array([c["cycle_time_s"] for c in numbers])
-        sigma = numbers[0]["sigma_px"]
-        usual = np.median(
-            random_plans(cell, arm, asked.half_turns, asked.random, sigma)
-        )
+        random = RandomPlans.of(cell, arm, predictions(cell, arm))
+        rng = np.random.default_rng(2)
+        drawn = [random.draw(rng, asked.half_turns) for _ in range(asked.random)]
+        usual = np.median([random.track_mm(chosen) for chosen in drawn])
         order = np.array([random_order_time(cell, arm, plan) for plan in plans])
         print(
             f"{name:<16} {len(plans):>3} of {asked.seeds:<2} "
