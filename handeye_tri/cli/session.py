@@ -267,11 +267,26 @@ def check(session: Path, as_json: bool) -> None:
     type=click.Path(path_type=Path, dir_okay=False),
     help="Write a picture of it instead; needs no display.",
 )
-@click.option("--station", type=int, help="Station to show in the picture.")
+@click.option("--station", type=int, help="Station to show; the worst used by default.")
+@click.option("--step", type=int, help="Solver step to show instead, from 0.")
+@click.option(
+    "--blueprint",
+    type=click.Choice(["overview", "cameras", "track"]),
+    help="Which tab to show.",
+)
 def replay(
-    session: Path, serve: bool, screenshot: Path | None, station: int | None
+    session: Path,
+    serve: bool,
+    screenshot: Path | None,
+    station: int | None,
+    step: int | None,
+    blueprint: str | None,
 ) -> None:
-    """Show a session's recording."""
+    """Show a session's recording, first at the worst station that was used."""
+    if serve and (station, step, blueprint) != (None, None, None):
+        raise click.UsageError(
+            "--station, --step and --blueprint are chosen in the page with --serve"
+        )
     from handeye_tri import replay as recording
     from handeye_tri.storage import SessionFolder
 
@@ -279,11 +294,17 @@ def replay(
     folder.require("report")
     path = folder.file("replay.rrd")
     if screenshot is not None:
-        problems = recording.screenshot(path, screenshot, station=station)
+        problems = recording.screenshot(
+            path,
+            screenshot,
+            station=station,
+            step=step,
+            blueprint=blueprint or recording.BLUEPRINTS[0],
+        )
         for problem in problems:
             click.echo(f"view error: {problem}", err=True)
         click.echo(f"wrote {screenshot}")
     elif serve:
         recording.serve(path)
     else:
-        recording.open_viewer(path)
+        recording.open_viewer(path, station, blueprint or recording.BLUEPRINTS[0], step)

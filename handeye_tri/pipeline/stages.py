@@ -191,6 +191,7 @@ def _hand_eye(run: Run) -> tuple[list[str], str]:
 def _report(run: Run) -> tuple[list[str], str]:
     from handeye_tri import replay
     from handeye_tri.pipeline.robot import with_robot_applied
+    from handeye_tri.pipeline.solver_steps import solver_steps
     from handeye_tri.report import Origin, render_report
 
     evaluation = run.evaluation()
@@ -210,7 +211,8 @@ def _report(run: Run) -> tuple[list[str], str]:
         calibration=hand_eye,
         track=track,
         truth=truth[0] if truth else None,
-        verdict=replay.verdict_markdown(evaluation),
+        evaluation=evaluation,
+        steps=solver_steps(session, run.cameras(), hand_eye),
     )
     header = run.folder.header
     page = render_report(

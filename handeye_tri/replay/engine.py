@@ -25,6 +25,7 @@ __all__ = [
     "RrdReader",
     "connect",
     "only_views",
+    "open_tab",
     "recorded",
     "rr",
     "rrb",
@@ -73,6 +74,20 @@ def recorded(
 def connect(url: str) -> ViewerClient:
     """A client of a running viewer."""
     return ViewerClient.connect(url)
+
+
+def open_tab(client: ViewerClient, number: int) -> None:
+    """Bring a tab of the recording's root container to the front.
+
+    Args:
+        client: Of a viewer that shows a recording.
+        number: Which tab, from 0.
+    """
+    layout = client.get_blueprint().blueprint
+    root = layout["/viewport"]["ViewportBlueprint"]["root_container"]
+    tabs = layout[f"/container/{root}"]["ContainerBlueprint"]
+    tabs["active_tab"] = tabs["contents"][number]
+    client.set_blueprint(layout, of="recording")
 
 
 def transform(motion: Floats) -> rr.Transform3D:

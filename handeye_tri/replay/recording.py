@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,40 +18,37 @@ from handeye_tri.records import (
     Session,
     TrackEvaluation,
 )
-from handeye_tri.replay.engine import (
-    RrdReader,
-    only_views,
-    recorded,
-    rr,
-    rrb,
-    solid,
-    transform,
+from handeye_tri.replay.drawing import (
+    body_path,
+    log_cameras,
+    log_cell,
+    log_gaps,
+    log_places,
+    log_tracks,
 )
-from handeye_tri.replay.shapes import (
-    crosses,
-    eye_on_cell,
-    eye_on_track,
-    rings,
+from handeye_tri.replay.engine import RrdReader, recorded, rr, transform
+from handeye_tri.replay.layout import layout
+from handeye_tri.replay.overlay import log_predicted, log_view
+from handeye_tri.replay.paths import NUMBERS, camera_path
+from handeye_tri.replay.shapes import ESTIMATE, HELD_OUT
+from handeye_tri.replay.steps import SolverStep
+from handeye_tri.replay.story import Story, tell
+from handeye_tri.replay.words import (
+    cameras_markdown,
+    log_lines,
+    numbers,
+    step_words,
+    steps_markdown,
+    track_markdown,
+    verdict_markdown,
 )
-from handeye_tri.replay.story import Story, legend, numbers, tell
-from handeye_tri.se3 import SE3, se3_inverse
+from handeye_tri.se3 import SE3
+from handeye_tri.triangle import VERTICES
 
 Floats = NDArray[np.float64]
 Photograph = Callable[[str, int], NDArray[np.uint8]]
-Colour = tuple[int, int, int]
 
-TIMELINE = "station"
-_NUMBERS = "numbers/track"
-# One colour each, in every view: what was estimated, what was held out, the truth.
-ESTIMATE: Colour = (64, 156, 255)
-HELD_OUT: Colour = (255, 149, 0)
-TRUTH: Colour = (165, 165, 165)
-WHITE: Colour = (255, 255, 255)
 _JPEG_QUALITY = 90
-# Our pixel (0, 0) is the first pixel's centre, rerun's is its outer corner.
-_CORNER = 0.5
-# How far before a camera its image is drawn, metres, and the truth's outline.
-_IMAGE_DISTANCE, _TRUTH_DISTANCE = 0.25, 0.29
 
 
 def write_recording(
@@ -66,7 +63,8 @@ def write_recording(
     calibration: HandEyeCalibration,
     track: TrackEvaluation,
     truth: GroundTruth | None,
-    verdict: str,
+    evaluation: Mapping[str, Any],
+    steps: Sequence[SolverStep] = (),
 ) -> None:
     """Write the recording of a calibrated session, whole or not at all.
 
@@ -85,7 +83,8 @@ def write_recording(
         calibration: The session's calibrated cell.
         track: Its held-out track; read back, the numbers are the same.
         truth: Of a simulated session.
-        verdict: The verdict in Markdown.
+        evaluation: The content of ``evaluation.json``.
+        steps: By which the calibration was reached, without the last one.
 
     Raises:
         InputError: poses, stations and track do not fit each other.
@@ -97,28 +96,102 @@ def write_recording(
             f"world_from_body must have shape ({n}, {len(mechanism.bodies)}, 4, 4) "
             f"for these stations and bodies, got {world_from_body.shape}"
         )
-    story = tell(session, calibration, track, truth)
-    layout = _layout(calibration, story, base_from_world)
-    with recorded(path, name, layout) as recording:
-        _log_cell(recording, mechanism, base_from_world)
-        _log_cameras(recording, calibration, truth)
-        _log_numbers(recording, story, track, verdict)
+    story = tell(session, calibration, track, truth, steps)
+    look = layout(calibration, story, base_from_world)
+    tracked = {int(j): k for k, j in enumerate(np.flatnonzero(story.held_out))}
+    with recorded(path, name, look) as recording:
+        log_cell(recording, mechanism, base_from_world)
+        log_cameras(recording, calibration, story, truth)
+        log_tracks(recording, story)
+        _log_words(recording, story, track, evaluation)
+        # What the cameras' places begin at, on every timeline.
+        _at(recording, station=0, step=len(story.slides) - 1, track=0)
+        log_places(recording, calibration, story, len(story.slides) - 1)
         for j in range(n):
-            recording.set_time(TIMELINE, sequence=j)
+            place = {"station": j, "track": tracked.get(j)}
+            _at(recording, **place)
+            log_gaps(recording, story, j, story.reported[j], story.observed[j])
+            # Solver steps are shown at the station that is shown first.
+            _at(recording, **place, step=0 if j == story.shown else None)
             for body, pose in enumerate(world_from_body[j][1:], 1):
-                recording.log(_body_path(mechanism, body), transform(pose))
-            _log_gaps(recording, story, j)
+                recording.log(body_path(mechanism, body), transform(pose))
             if story.held_out[j]:
                 recording.log(
                     "error_mm/predicted", rr.Scalars(1e3 * track.predicted_rms)
                 )
             for i, camera in enumerate(calibration.cameras):
-                _log_view(recording, session, story, i, camera.name, j)
+                log_view(recording, session, story, i, camera, j)
                 image = rr.Image(photograph(camera.name, j))
                 recording.log(
-                    f"{_camera_path(camera.name)}/image",
+                    f"{camera_path(camera.name)}/image",
                     image.compress(jpeg_quality=_JPEG_QUALITY),
                 )
+        for step in range(len(story.slides)):
+            _at(recording, step=step)
+            _log_step(recording, session, calibration, story, step)
+
+
+def _at(recording: rr.RecordingStream, **sequence: int | None) -> None:
+    """Log what follows at these places of the timelines and on no other."""
+    recording.reset_time()
+    for timeline, place in sequence.items():
+        if place is not None:
+            recording.set_time(timeline, sequence=place)
+
+
+def _log_step(
+    recording: rr.RecordingStream,
+    session: Session,
+    calibration: HandEyeCalibration,
+    story: Story,
+    step: int,
+) -> None:
+    """The cell at a solver step, at the station that is shown first."""
+    slide, j = story.slides[step], story.shown
+    log_places(recording, calibration, story, step)
+    log_gaps(recording, story, j, slide.reported, slide.observed)
+    recording.log("log", rr.TextLog(step_words(slide), level="INFO"))
+    colour = HELD_OUT if story.held_out[j] else ESTIMATE
+    for i, camera in enumerate(calibration.cameras):
+        log_predicted(
+            *(recording, story, camera.name, session.pixels[i, j]),
+            *(slide.predicted[i], colour),
+        )
+
+
+def _log_words(
+    recording: rr.RecordingStream,
+    story: Story,
+    track: TrackEvaluation,
+    evaluation: Mapping[str, Any],
+) -> None:
+    for path, text in (
+        ("verdict", verdict_markdown(evaluation, story, track)),
+        ("cameras", cameras_markdown(evaluation)),
+        ("steps", steps_markdown(story)),
+        ("track_table", track_markdown(track, evaluation)),
+    ):
+        markdown = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+        recording.log(path, markdown, static=True)
+    # Python's JSON of a 64-bit number reads back as that number.
+    data = rr.TextDocument(json.dumps(numbers(story, track)))
+    recording.log(NUMBERS, data, static=True)
+    for group, colour, word in (
+        ("used", ESTIMATE, "used"),
+        ("held_out", HELD_OUT, "held out"),
+    ):
+        marks = rr.SeriesPoints(
+            colors=[colour] * 3,
+            names=[f"{word} {letter}" for letter in VERTICES],
+            markers=["circle", "square", "diamond"],
+            marker_sizes=[5.0] * 3,
+        )
+        recording.log(f"error_mm/{group}", marks, static=True)
+    line = rr.SeriesLines(colors=[HELD_OUT], names=["predicted rms"], widths=[1.0])
+    recording.log("error_mm/predicted", line, static=True)
+    for line_ in log_lines(story, evaluation):
+        _at(recording, station=line_.station)
+        recording.log("log", rr.TextLog(line_.text, level=line_.level))
 
 
 def read_numbers(path: Path) -> dict[str, Any]:
@@ -134,7 +207,7 @@ def read_numbers(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise StorageError(f"{path}: this file is missing; run: handeye-tri report")
     try:
-        chunks = RrdReader(path).stream().filter(content=f"/{_NUMBERS}").to_chunks()
+        chunks = RrdReader(path).stream().filter(content=f"/{NUMBERS}").to_chunks()
         text = chunks[0].to_record_batch().column("TextDocument:text")[0].as_py()[0]
         return dict(json.loads(text))
     except (ValueError, RuntimeError, OSError, IndexError, KeyError) as error:
@@ -142,256 +215,3 @@ def read_numbers(path: Path) -> dict[str, Any]:
             f"{path}: not a recording of ours, or damaged ({error}); write it again: "
             "handeye-tri report"
         ) from None
-
-
-def _camera_path(name: str) -> str:
-    return f"cell/base/estimate/{name}"
-
-
-def _body_path(mechanism: Mechanism, body: int) -> str:
-    if body == 0:
-        return "cell/surroundings"
-    name = mechanism.bodies[body].name
-    return f"cell/robot/{rr.escape_entity_path_part(name)}"
-
-
-def _log_cell(
-    recording: rr.RecordingStream, mechanism: Mechanism, base_from_world: SE3
-) -> None:
-    recording.log("cell", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    world_from_base = se3_inverse(base_from_world.matrix)
-    recording.log("cell/base", transform(world_from_base), static=True)
-    recording.log("track", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for geometry in mechanism.geometries:
-        body = _body_path(mechanism, geometry.body)
-        path = f"{body}/{rr.escape_entity_path_part(geometry.name)}"
-        recording.log(path, transform(geometry.body_from_geometry.matrix), static=True)
-        recording.log(path, solid(geometry), static=True)
-
-
-def _log_cameras(
-    recording: rr.RecordingStream,
-    calibration: HandEyeCalibration,
-    truth: GroundTruth | None,
-) -> None:
-    sources: list[tuple[str, Any, Colour, float, float]] = [
-        ("estimate", calibration, ESTIMATE, _IMAGE_DISTANCE, 0.002)
-    ]
-    if truth is not None:
-        sources.append(("truth", truth, TRUTH, _TRUTH_DISTANCE, 0.001))
-    views = [
-        (source, camera, motion, *look)
-        for source, owner, *look in sources
-        for camera, motion in zip(owner.cameras, owner.base_from_camera, strict=True)
-    ]
-    to_corner = np.array([[0.0, 0.0, _CORNER], [0.0, 0.0, _CORNER], [0.0, 0.0, 0.0]])
-    for source, camera, motion, colour, distance, width in views:
-        path = f"cell/base/{source}/{camera.name}"
-        recording.log(path, transform(motion.matrix), static=True)
-        recording.log(
-            path,
-            rr.Pinhole(
-                image_from_camera=camera.intrinsics.matrix + to_corner,
-                resolution=camera.image_size,
-                camera_xyz=rr.ViewCoordinates.RDF,
-                image_plane_distance=distance,
-                color=colour,
-                line_width=width,
-            ),
-            static=True,
-        )
-        # The lowest layer over an image can sink into it by rounding of depths, so
-        # that layer is one point that nobody sees.
-        recording.log(
-            f"{path}/nothing",
-            rr.Points2D([[0.0, 0.0]], colors=[(0, 0, 0, 0)], radii=[0.0], draw_order=1),
-            static=True,
-        )
-
-
-def _log_view(
-    recording: rr.RecordingStream,
-    session: Session,
-    story: Story,
-    i: int,
-    camera: str,
-    j: int,
-) -> None:
-    """What camera i saw at station j, over its image."""
-    path = _camera_path(camera)
-    colour = HELD_OUT if story.held_out[j] else ESTIMATE
-    seen = session.pixels[i, j] + _CORNER
-    predicted = story.predicted[i, j] + _CORNER
-    turn = story.turns[i][j]
-    found, known = (np.isfinite(p).all(axis=1) for p in (seen, predicted))
-    plus = crosses(predicted[known])
-    # Negative radii are widths on the screen, however large the image is shown.
-    for name, strips, paint, width, order in (
-        ("half_turn", [line + _CORNER for line in turn.lines], WHITE, -0.5, 30),
-        ("seen", rings(seen[found]), colour, -1.2, 20),
-        # White on dark, and with a dark edge on white.
-        ("predicted/edge", plus, (0, 0, 0), -1.6, 21),
-        ("predicted", plus, WHITE, -0.7, 22),
-    ):
-        recording.log(
-            f"{path}/{name}",
-            rr.LineStrips2D(strips, colors=[paint], radii=[width], draw_order=order),
-        )
-    both = found & known
-    recording.log(
-        f"{path}/gap",
-        rr.Arrows2D(
-            origins=predicted[both],
-            vectors=story.magnification_px * (seen - predicted)[both],
-            colors=[colour],
-            radii=[-1.2],
-            draw_order=23,
-        ),
-    )
-    visible = np.isfinite(turn.centre).all()
-    recording.log(
-        f"{path}/O",
-        rr.Points2D(
-            [turn.centre + _CORNER] if visible else [],
-            colors=[WHITE],
-            radii=[-2.5],
-            labels=["O"] if visible else None,
-            draw_order=31,
-        ),
-    )
-
-
-def _log_gaps(recording: rr.RecordingStream, story: Story, j: int) -> None:
-    """Robot against cameras at station j, in the cell and beside it."""
-    colour = HELD_OUT if story.held_out[j] else ESTIMATE
-    gaps = story.observed[j] - story.reported[j]
-    seen = np.isfinite(gaps).all(axis=1)
-    millimetres = 1e3 * np.linalg.norm(gaps, axis=1)
-    for path, width in (("cell/base/gap", 0.004), ("track/gap", 0.002)):
-        recording.log(
-            path,
-            rr.Arrows3D(
-                origins=story.reported[j][seen],
-                vectors=story.magnification * gaps[seen],
-                colors=[colour],
-                radii=[width],
-            ),
-        )
-    worst = f"{np.nanmax(millimetres):.2f} mm" if seen.any() else "not seen"
-    recording.log(
-        "cell/base/gap/size",
-        rr.Points3D(
-            [story.reported[j].mean(axis=0) + [0.0, 0.0, 0.15]],
-            colors=[colour],
-            radii=[0.0],
-            labels=[f"station {j}: {worst}"],
-        ),
-    )
-    far = [story.far(story.observed)[j, [0, 1, 2, 0]]] if seen.all() else []
-    for source, strips, paint in (
-        ("robot", [story.reported[j, [0, 1, 2, 0]]], ESTIMATE),
-        ("cameras", far, colour),
-    ):
-        recording.log(
-            f"track/now/{source}",
-            rr.LineStrips3D(strips, colors=[paint], radii=[0.0012]),
-        )
-    # Scalars are 64-bit: what is read back is what was evaluated.
-    group = "held_out" if story.held_out[j] else "used"
-    recording.log(f"error_mm/{group}", rr.Scalars(millimetres))
-
-
-def _log_numbers(
-    recording: rr.RecordingStream, story: Story, track: TrackEvaluation, verdict: str
-) -> None:
-    text = f"{verdict}\n\n---\n{legend(story)}"
-    markdown = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
-    recording.log("verdict", markdown, static=True)
-    # Python's JSON of a 64-bit number reads back as that number.
-    data = rr.TextDocument(json.dumps(numbers(story, track)))
-    recording.log(_NUMBERS, data, static=True)
-    for group, colour, word in (
-        ("used", ESTIMATE, "used"),
-        ("held_out", HELD_OUT, "held out"),
-    ):
-        marks = rr.SeriesPoints(
-            colors=[colour] * 3,
-            names=[f"{word} {letter}" for letter in "ABC"],
-            markers=["circle", "square", "diamond"],
-            marker_sizes=[5.0] * 3,
-        )
-        recording.log(f"error_mm/{group}", marks, static=True)
-    line = rr.SeriesLines(colors=[HELD_OUT], names=["predicted rms"], widths=[1.0])
-    recording.log("error_mm/predicted", line, static=True)
-    colours = {"robot": ESTIMATE, "cameras": HELD_OUT, "truth": TRUTH}
-    for source, places in story.tracks().items():
-        look = {"colors": [colours[source]], "radii": [0.001]}
-        recording.log(f"track/{source}", rr.LineStrips3D([places], **look), static=True)
-        points = rr.Points3D(places, colors=[colours[source]], radii=[0.004])
-        recording.log(f"track/{source}/stations", points, static=True)
-
-
-def _layout(
-    calibration: HandEyeCalibration, story: Story, base_from_world: SE3
-) -> rrb.Blueprint:
-    """Which views a person sees, where, and from which side."""
-    images = [
-        rrb.Spatial2DView(
-            origin=_camera_path(camera.name),
-            name=f"{camera.name}: o seen, + predicted, gap x {story.magnification_px}",
-        )
-        for camera in calibration.cameras
-    ]
-    # Frusta alone: by default a camera shows its axes too, as long as itself.
-    frusta = {
-        f"cell/base/{source}/{camera.name}": rr.Pinhole.from_fields()
-        for camera in calibration.cameras
-        for source in ("estimate", "truth")
-    }
-    gap = f"gap x {story.magnification}"
-    cell, track = (
-        rrb.Spatial3DView(
-            origin=origin,
-            name=f"{name}, {gap}",
-            background=[24, 26, 30],
-            line_grid=rrb.LineGrid3D(visible=False),
-            overrides=frusta if origin == "cell" else None,
-            eye_controls=rrb.EyeControls3D(
-                position=eye.position, look_target=eye.target, eye_up=[0, 0, 1]
-            ),
-        )
-        for origin, name, eye in (
-            (
-                "cell",
-                "Cell; arrows from robot to cameras",
-                eye_on_cell(calibration, story, base_from_world),
-            ),
-            ("track", "Held-out track", eye_on_track(calibration, story)),
-        )
-    )
-    n = len(story.held_out)
-    errors = rrb.TimeSeriesView(
-        origin="error_mm",
-        name="Robot against cameras at each station, mm; orange was held out",
-        axis_x=rrb.TimeAxis(
-            view_range=rr.TimeRange(
-                start=rr.TimeRangeBoundary.absolute(seq=-1),
-                end=rr.TimeRangeBoundary.absolute(seq=n),
-            )
-        ),
-        axis_y=rrb.ScalarAxis(range=(0.0, 1.15 * story.largest_mm)),
-        plot_legend=rrb.PlotLegend(visible=False),
-    )
-    text = rrb.TextDocumentView(origin="verdict", name="Verdict")
-    layout = rrb.Horizontal(
-        rrb.Vertical(cell, errors, row_shares=[7, 3]),
-        rrb.Grid(*images, grid_columns=1 if len(images) < 3 else 2),
-        rrb.Vertical(text, track, row_shares=[12, 8]),
-        column_shares=[9.5, 6.5, 4],
-    )
-    return only_views(
-        layout,
-        rrb.TimePanel(
-            state="collapsed", timeline=TIMELINE, play_state="following", fps=2.0
-        ),
-    )

@@ -13,6 +13,14 @@ from handeye_tri.se3 import SE3
 
 Floats = NDArray[np.float64]
 
+Colour = tuple[int, int, int]
+
+# One colour each, in every view: what was estimated, what was held out, the truth.
+ESTIMATE: Colour = (64, 156, 255)
+HELD_OUT: Colour = (255, 149, 0)
+TRUTH: Colour = (165, 165, 165)
+WHITE: Colour = (255, 255, 255)
+
 _RING_PX = 24.0
 _TURN = np.linspace(0.0, 2.0 * np.pi, 33)
 _RING = _RING_PX * np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)
@@ -76,17 +84,31 @@ def eye_on_cell(
     towards = _level(centres.mean(axis=0) - rig)
     side = np.cross([0.0, 0.0, 1.0], towards)
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    return Eye(target + size * (0.72 * towards - 0.68 * side + [0, 0, 0.42]), target)
+    return Eye(target + size * (0.8 * towards - 0.42 * side + [0, 0, 0.42]), target)
 
 
 def eye_on_track(calibration: HandEyeCalibration, story: Story) -> Eye:
     """The held-out track as the first camera sees it, in the base."""
     target = story.reported[story.held_out].mean(axis=(0, 1))
-    lengths = np.linalg.norm(story.reported - target, axis=-1)
-    # Held-out stations fill the view; nearly all of the others are in it.
-    reach = max(float(lengths[story.held_out].max()), 0.8 * float(lengths.max()))
+    reach = float(
+        np.linalg.norm(story.reported[story.held_out] - target, axis=-1).max()
+    )
     towards = calibration.base_from_camera[0].translation - target
-    return Eye(target + 1.7 * reach * towards / np.linalg.norm(towards), target)
+    return Eye(target + 1.6 * reach * towards / np.linalg.norm(towards), target)
+
+
+def eye_on_cameras(calibration: HandEyeCalibration, base_from_world: SE3) -> Eye:
+    """All cameras in view, in the world: from behind and above."""
+    world_from_base = base_from_world.inverse()
+    motions = [world_from_base @ motion for motion in calibration.base_from_camera]
+    centres = np.array([motion.translation for motion in motions])
+    looks = np.mean([motion.rotation[:, 2] for motion in motions], axis=0)
+    target = 0.5 * (centres.min(axis=0) + centres.max(axis=0)) + 0.1 * looks
+    size = max(float(np.linalg.norm(np.ptp(centres, axis=0))), 0.25)
+    towards = _level(looks)
+    side = np.cross([0.0, 0.0, 1.0], towards)
+    away = -1.15 * towards + 0.5 * side + [0.0, 0.0, 0.9]
+    return Eye(target + (size + 0.12) * away, target)
 
 
 def _level(direction: Floats) -> Floats:

@@ -2,51 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.camera import PinholeCamera
 from handeye_tri.errors import InputError
-from handeye_tri.evaluate import evaluate_track
-from handeye_tri.evaluate.views import predicted_pixels
+from handeye_tri.evaluate.views import ViewCheck, check_views, predicted_pixels
 from handeye_tri.records import (
     GroundTruth,
     HandEyeCalibration,
     Session,
     TrackEvaluation,
+    motion_labels,
+)
+from handeye_tri.replay.half_turns import HalfTurnView, half_turn_views
+from handeye_tri.replay.steps import (
+    Slide,
+    SolverStep,
+    magnification,
+    slides_of,
+    used_track,
 )
 from handeye_tri.summary import round_magnification
-from handeye_tri.triangle import EDGES, Axis
+from handeye_tri.triangle import VERTICES
 
 Floats = NDArray[np.float64]
 
 # A gap is drawn as long as this at most, metres; the eye reads it beside the rig.
-_LONGEST_ARROW = 0.12
+_LONGEST_ARROW = 0.25
 # An arrow in an image is as long as this at most, pixels.
-_LONGEST_ARROW_PX = 60.0
-# Points per drawn half-turn line: enough to show what a lens bends.
-_LINE_POINTS = 17
-# Two places of one marker closer than this lie on the axis, pixels.
-_STANDS_STILL = 8.0
+_LONGEST_ARROW_PX = 100.0
+# Half an axis of an ellipsoid about a camera is as long as this at most, metres.
+_LARGEST_ELLIPSOID = 0.09
+# 95 % of three normal errors lie within so many sigmas of each: chi-square, 3 degrees.
+_SIGMAS_95 = 2.7955
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HalfTurnView:
-    """What one camera saw of a half-turn.
+class Ellipsoid:
+    """Where 95 % of a camera's position errors lie, magnified; axes of the camera.
 
     Attributes:
-        lines: From each moving marker before to the same after, as curves that the
-            lens bends; each of shape (p, 2), pixels.
-        centre: O, where the lines meet the axis, shape (2,), pixels; NaN where the
-            view does not show it.
+        half_sizes: Shape (3,), metres, magnified.
+        rotation: From the ellipsoid's axes to the camera's, shape (3, 3).
+        truth: The true position in the camera's frame, magnified alike, (3,), metres;
+            None without truth.
     """
 
-    lines: tuple[Floats, ...]
-    centre: Floats
+    half_sizes: Floats
+    rotation: Floats
+    truth: Floats | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,8 +70,14 @@ class Story:
             centre, shape (m, n, 3, 2), pixels.
         turns: Per camera and station, the half-turn that the station belongs to;
             without lines where it belongs to none.
+        shown: The station that is shown first: the used one with the largest gap.
+        checks: Every view against what is predicted for it, most unlikely first.
+        slides: Solver steps, the last one as calibrated.
+        ellipsoids: One per camera.
         magnification: How much longer than true the gaps in space are drawn.
         magnification_px: How much longer the gaps in the images are drawn.
+        magnification_slide: The same of the cameras between solver steps.
+        magnification_ellipsoid: The same of the ellipsoids.
     """
 
     held_out: NDArray[np.bool_]
@@ -73,8 +86,30 @@ class Story:
     actual: Floats | None
     predicted: Floats
     turns: tuple[tuple[HalfTurnView, ...], ...]
+    shown: int
+    checks: tuple[ViewCheck, ...]
+    slides: tuple[Slide, ...]
+    ellipsoids: tuple[Ellipsoid, ...]
     magnification: int
     magnification_px: int
+    magnification_slide: int
+    magnification_ellipsoid: int
+
+    @property
+    def distances_mm(self) -> Floats:
+        """Gap of robot and cameras, shape (n, 3), mm; NaN = not seen by two cameras."""
+        return np.asarray(1e3 * np.linalg.norm(self.observed - self.reported, axis=-1))
+
+    def worst(self, j: int) -> tuple[str, float]:
+        """The marker with the largest gap at station j, and that gap, mm.
+
+        The letter is empty where no marker was seen by two cameras.
+        """
+        gaps = self.distances_mm[j]
+        if not np.isfinite(gaps).any():
+            return "", float("nan")
+        k = int(np.nanargmax(gaps))
+        return VERTICES[k], float(gaps[k])
 
     def far(self, points: Floats) -> Floats:
         """Put markers, (n, 3, 3), so many times farther from where the robot says."""
@@ -99,8 +134,7 @@ class Story:
     @property
     def largest_mm(self) -> float:
         """Largest gap of robot and cameras at any station, mm."""
-        gaps = np.linalg.norm(self.observed - self.reported, axis=-1)
-        return 1e3 * float(np.nanmax(gaps))
+        return float(np.nanmax(self.distances_mm))
 
 
 def tell(
@@ -108,6 +142,7 @@ def tell(
     calibration: HandEyeCalibration,
     track: TrackEvaluation,
     truth: GroundTruth | None,
+    steps: Sequence[SolverStep] = (),
 ) -> Story:
     """Prepare a session for drawing.
 
@@ -116,6 +151,7 @@ def tell(
         calibration: Its calibrated cell.
         track: Its held-out track; these very positions are drawn.
         truth: Of a simulated session.
+        steps: By which the calibration was reached, without the last one.
 
     Raises:
         InputError: the track is not of this session.
@@ -133,7 +169,7 @@ def tell(
         )
     reported = _move(session.base_from_flange, calibration.markers)
     observed = np.full((n, 3, 3), np.nan)
-    for rows in (_used_track(session, calibration), track):
+    for rows in (used_track(session, calibration), track):
         if rows is not None:
             observed[rows.stations, rows.markers] = rows.observed
             reported[rows.stations, rows.markers] = rows.reported
@@ -144,6 +180,9 @@ def tell(
             markers = truth.flange_from_triangle.apply(session.triangle.points)
         actual = _move(truth.base_from_flange, markers)
     predicted = predicted_pixels(calibration, session)
+    shown = _worst_used(observed - reported, held_out, worst_station(track))
+    slides, slide = slides_of(session, calibration, steps, shown)
+    ellipsoids, larger = _ellipsoids(calibration, truth)
     return Story(
         held_out=held_out,
         reported=reported,
@@ -151,12 +190,54 @@ def tell(
         actual=actual,
         predicted=predicted,
         turns=tuple(
-            _half_turns(session, i, camera)
+            half_turn_views(session, i, camera)
             for i, camera in enumerate(calibration.cameras)
         ),
-        magnification=_magnification(observed - reported, _LONGEST_ARROW),
-        magnification_px=_magnification(session.pixels - predicted, _LONGEST_ARROW_PX),
+        shown=shown,
+        checks=check_views(calibration, session),
+        slides=slides,
+        ellipsoids=ellipsoids,
+        magnification=magnification(observed - reported, _LONGEST_ARROW),
+        magnification_px=magnification(session.pixels - predicted, _LONGEST_ARROW_PX),
+        magnification_slide=slide,
+        magnification_ellipsoid=larger,
     )
+
+
+def _worst_used(gaps: Floats, held_out: NDArray[np.bool_], otherwise: int) -> int:
+    """The used station with the largest gap, (n, 3, 3); otherwise where none has one.
+
+    Without held-out stations each was held out in turn: then it is the worst of all.
+    """
+    used = ~held_out if not held_out.all() else held_out
+    lengths = np.linalg.norm(gaps, axis=-1)
+    lengths[~used | ~np.isfinite(lengths).any(axis=1)] = np.nan
+    if not np.isfinite(lengths).any():
+        return otherwise
+    return int(np.nanargmax(lengths) // 3)
+
+
+def _ellipsoids(
+    calibration: HandEyeCalibration, truth: GroundTruth | None
+) -> tuple[tuple[Ellipsoid, ...], int]:
+    """The cameras' 95 % ellipsoids and how many times too large they are."""
+    values, axes, errors = [], [], []
+    for i, camera in enumerate(calibration.cameras):
+        labels = motion_labels(f"base_from_{camera.name}")[:3]
+        value, axis = np.linalg.eigh(calibration.covariance.block(labels))
+        values.append(_SIGMAS_95 * np.sqrt(np.maximum(value, 0.0)))
+        # A rotation: its axes are right-handed.
+        axes.append(axis * np.sign(np.linalg.det(axis)))
+        if truth is not None:
+            motion = calibration.base_from_camera[i]
+            errors.append(motion.inverse().apply(truth.base_from_camera[i].translation))
+    factor = round_magnification(float(np.max(values)), _LARGEST_ELLIPSOID)
+    return tuple(
+        Ellipsoid(
+            factor * value, axis, factor * errors[i] if truth is not None else None
+        )
+        for i, (value, axis) in enumerate(zip(values, axes, strict=True))
+    ), factor
 
 
 def _move(base_from_flange: Floats, markers: Floats) -> Floats:
@@ -165,144 +246,6 @@ def _move(base_from_flange: Floats, markers: Floats) -> Floats:
     return np.asarray(turned + base_from_flange[:, None, :3, 3])
 
 
-def _used_track(
-    session: Session, calibration: HandEyeCalibration
-) -> TrackEvaluation | None:
-    """Both tracks at the stations that the calibration used."""
-    kinds = {"calibration": "evaluation", "evaluation": "calibration"}
-    stations = tuple(
-        replace(station, kind=kinds[station.kind])  # type: ignore[arg-type]
-        for station in session.stations
-    )
-    seen = np.isfinite(session.pixels).all(axis=-1).sum(axis=0) >= 2
-    if not seen[session.indices("calibration")].any():
-        return None
-    swapped = replace(session, stations=stations, half_turns=())
-    return evaluate_track(calibration, swapped)
-
-
-def _half_turns(
-    session: Session, i: int, camera: PinholeCamera
-) -> tuple[HalfTurnView, ...]:
-    views = [HalfTurnView((), np.full(2, np.nan)) for _ in session.stations]
-    for turn in session.half_turns:
-        seen = _half_turn(
-            camera,
-            session.pixels[i, turn.before],
-            session.pixels[i, turn.after],
-            turn.axis,
-        )
-        views[turn.before] = views[turn.after] = seen
-    return tuple(views)
-
-
-def _half_turn(
-    camera: PinholeCamera, before: Floats, after: Floats, axis: Axis
-) -> HalfTurnView:
-    """Lines from each marker to its twin, and O where they meet the axis.
-
-    About the normal all three lines pass through O (Zhao, Liu and Zhang 2008,
-    Sec. III-A); about an edge the third vertex' line meets that edge in the foot of
-    its perpendicular (Sec. III-B).
-    """
-    moved = np.linalg.norm(after - before, axis=1) > _STANDS_STILL
-    # Lines are straight where there is no lens.
-    start, end = camera.normalised(before[moved]), camera.normalised(after[moved])
-    along = np.linspace(0.0, 1.0, _LINE_POINTS)[:, None, None]
-    curves = camera.pixels(start + along * (end - start))
-    pairs = list(zip(start, end, strict=True))
-    if axis in EDGES:
-        on_axis = camera.normalised(before[list(EDGES[axis])])
-        if np.isfinite(on_axis).all():
-            pairs.append((on_axis[0], on_axis[1]))
-    centre = np.full(2, np.nan)
-    if len(pairs) >= 2:
-        centre = camera.pixels(_meeting_point(np.array(pairs)))
-    return HalfTurnView(tuple(np.moveaxis(curves, 1, 0)), centre)
-
-
-def _meeting_point(pairs: Floats) -> Floats:
-    """Point nearest to lines through pairs of points, (k, 2, 2) -> (2,)."""
-    along = pairs[:, 1] - pairs[:, 0]
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    offset = (normal * pairs[:, 0]).sum(axis=1)
-    return np.asarray(np.linalg.lstsq(normal, offset)[0])
-
-
-def _magnification(gaps: Floats, longest: float) -> int:
-    """By how much gaps, shape (..., d) with NaN left out, are drawn too long."""
-    lengths = np.linalg.norm(gaps, axis=-1)
-    return round_magnification(float(np.nanmax(lengths, initial=0.0)), longest)
-
-
 def worst_station(track: TrackEvaluation) -> int:
     """The held-out station with the largest error."""
     return int(track.stations[np.argmax(track.distances)])
-
-
-def numbers(story: Story, track: TrackEvaluation) -> dict[str, Any]:
-    """What a recording carries to be read back, with the units in the keys."""
-    return {
-        "station_count": len(story.held_out),
-        "worst_station": worst_station(track),
-        "stations": track.stations.tolist(),
-        "markers": track.markers.tolist(),
-        "reported_m": track.reported.tolist(),
-        "observed_m": track.observed.tolist(),
-        "predicted_covariance_m2": track.predicted_covariance.tolist(),
-        "mean_mm": 1e3 * track.mean,
-        "rms_mm": 1e3 * track.rms,
-        "max_mm": 1e3 * track.max,
-        "predicted_rms_mm": 1e3 * track.predicted_rms,
-    }
-
-
-def legend(story: Story) -> str:
-    """How to read the pictures."""
-    truth = " **Grey**: the truth." if story.actual is not None else ""
-    return (
-        "**Blue**: what was calibrated, and the stations it used. **Orange**: held "
-        f"out.{truth}\n\nImages: o where a marker is seen, + where calibration and "
-        f"robot put it, the arrow between them {story.magnification_px} times too "
-        "long. White lines join a marker before and after a half-turn and meet in "
-        f"O.\n\nIn space: from robot to cameras, {story.magnification} times too long."
-    )
-
-
-def verdict_markdown(evaluation: Mapping[str, Any]) -> str:
-    """The verdict for the recording, from ``evaluation.json``.
-
-    Args:
-        evaluation: The content of ``evaluation.json``.
-    """
-    track = evaluation["track"]
-    ran = [gate for gate in evaluation["gates"] if gate["verdict"] != "not run"]
-    met = sum(gate["verdict"] != "bad" for gate in ran)
-    source = (
-        "SIMULATED: truth known, used only to score"
-        if evaluation["simulated"]
-        else "REAL robot"
-    )
-    lines = [
-        f"# {evaluation['verdict']}",
-        f"{met} of {len(ran)} gates met, {len(evaluation['gates']) - len(ran)} not "
-        f"run. {source}.",
-        "",
-        evaluation["sentence"],
-        "",
-        f"**Look at station {track['worst_station']}**, the worst that was held out: "
-        f"marker {track['worst_marker']} is {track['max_mm']:.3f} mm off.",
-        "",
-        f"Held-out track: {track['mean_mm']:.3f} mm mean, {track['rms_mm']:.3f} rms "
-        f"(predicted {track['predicted_rms_mm']:.3f}).",
-        "",
-        f"Nearest to failing: {evaluation['nearest']}.",
-    ]
-    for finding in evaluation["findings"]:
-        lines += [
-            "",
-            f"**{finding['code']}** {finding['cause']} ({finding['evidence']}). "
-            f"Do: {finding['remedy']}.",
-        ]
-    return "\n".join(lines)

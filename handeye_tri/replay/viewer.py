@@ -16,16 +16,20 @@ from typing import Any
 from urllib.parse import quote
 
 from handeye_tri.errors import HandEyeError, InputError, MissingDependencyError
-from handeye_tri.replay.engine import connect
-from handeye_tri.replay.recording import TIMELINE, read_numbers
+from handeye_tri.replay.engine import connect, open_tab
+from handeye_tri.replay.layout import BLUEPRINTS
+from handeye_tri.replay.paths import STATION, STEP
+from handeye_tri.replay.recording import read_numbers
 from handeye_tri.storage import write_bytes
 
 # Servers of ours are for the user of this machine only.
 _LOOPBACK = "127.0.0.1"
 _START_S = 30.0
 _LOAD_S = 60.0
-# A view reports what it cannot draw after it has been drawn.
-_SETTLE_S = 0.7
+# A view reports what it cannot draw after it has been drawn, and an image appears when
+# it has been unpacked: a picture is taken when so many in a row are the same.
+_SETTLE_S = 0.4
+_STILL = 3
 _END_S = 5.0
 
 _NO_VULKAN = (
@@ -46,6 +50,8 @@ def screenshot(
     *,
     size: tuple[int, int] = (1600, 1000),
     station: int | None = None,
+    blueprint: str = BLUEPRINTS[0],
+    step: int | None = None,
 ) -> list[str]:
     """Draw a recording into a PNG; needs no display.
 
@@ -53,7 +59,9 @@ def screenshot(
         recording: A file by :func:`handeye_tri.replay.write_recording`.
         picture: Where the PNG goes.
         size: (width, height), pixels.
-        station: Which station to show; the worst that was held out by default.
+        station: Which station to show; by default the worst that was used.
+        blueprint: Which tab to show, one of BLUEPRINTS.
+        step: Which solver step to show, at that worst station, instead of a station.
 
     Returns:
         What the views could not draw, one sentence each; empty when all is well.
@@ -63,16 +71,13 @@ def screenshot(
         MissingDependencyError: there is no Vulkan driver.
         HandEyeError: the viewer did not answer in time.
     """
-    at = _station(recording, station)
-    with tempfile.TemporaryDirectory(prefix="handeye-tri-") as folder:
-        drawn = Path(folder) / "picture.png"
-        options = ["--headless", "--window-size", f"{size[0]}x{size[1]}"]
-        with _viewer(options) as (process, client):
-            _open_at(process, client, recording, at)
-            time.sleep(_SETTLE_S)
-            client.save_screenshot(str(drawn))
-            views = client.get_state().views
-        write_bytes(picture, drawn.read_bytes())
+    place = _place(recording, station, step, blueprint)
+    options = ["--headless", "--window-size", f"{size[0]}x{size[1]}"]
+    with _viewer(options) as (process, client):
+        _open_at(process, client, recording, *place)
+        drawn = _when_still(client)
+        views = client.get_state().views
+    write_bytes(picture, drawn)
     return [
         f"{view.name}: {report.summary}"
         + (f" ({report.details})" if report.details else "")
@@ -81,20 +86,27 @@ def screenshot(
     ]
 
 
-def open_viewer(recording: Path, station: int | None = None) -> None:
+def open_viewer(
+    recording: Path,
+    station: int | None = None,
+    blueprint: str = BLUEPRINTS[0],
+    step: int | None = None,
+) -> None:
     """Show a recording in a window and wait until the user closes it.
 
     Args:
         recording: A file by :func:`handeye_tri.replay.write_recording`.
-        station: Which station to begin at; the worst that was held out by default.
+        station: Which station to begin at; by default the worst that was used.
+        blueprint: Which tab to begin with, one of BLUEPRINTS.
+        step: Which solver step to begin at instead of a station.
 
     Raises:
         InputError: the recording has no such station, or is none of ours.
         MissingDependencyError: no window can be opened.
     """
-    at = _station(recording, station)
+    place = _place(recording, station, step, blueprint)
     with _viewer([]) as (process, client):
-        _open_at(process, client, recording, at)
+        _open_at(process, client, recording, *place)
         process.wait()
 
 
@@ -135,17 +147,28 @@ def _to_stderr(line: str) -> None:
     sys.stderr.write(line + "\n")
 
 
-def _station(recording: Path, station: int | None) -> int:
-    """The station to show; reads the file before anything is started."""
+def _place(
+    recording: Path, station: int | None, step: int | None, blueprint: str
+) -> tuple[str, int, str]:
+    """Timeline, where on it, and tab; reads the file before anything is started."""
     numbers = read_numbers(recording)
-    count = int(numbers["station_count"])
-    if station is None:
-        return int(numbers["worst_station"])
-    if not 0 <= station < count:
+    if blueprint not in BLUEPRINTS:
         raise InputError(
-            f"station {station} is not in {recording}: it has 0 to {count - 1}"
+            f"blueprint {blueprint!r} is not in {recording}: it has "
+            f"{', '.join(BLUEPRINTS)}"
         )
-    return station
+    if station is not None and step is not None:
+        raise InputError("give a station or a step to show, not both")
+    timeline, at, count = STATION, station, int(numbers["station_count"])
+    if step is not None:
+        timeline, at, count = STEP, step, int(numbers["step_count"])
+    if at is None:
+        at = int(numbers["shown_station"])
+    if not 0 <= at < count:
+        raise InputError(
+            f"{timeline} {at} is not in {recording}: it has 0 to {count - 1}"
+        )
+    return timeline, at, blueprint
 
 
 def _free_port() -> int:
@@ -234,13 +257,32 @@ def _viewer(options: Sequence[str]) -> Iterator[tuple[subprocess.Popen[bytes], A
 
 
 def _open_at(
-    process: subprocess.Popen[bytes], client: Any, recording: Path, station: int
+    process: subprocess.Popen[bytes],
+    client: Any,
+    recording: Path,
+    timeline: str,
+    at: int,
+    blueprint: str,
 ) -> None:
-    """Open a recording, wait until it is loaded, and go to a station."""
+    """Open a recording, wait until it is loaded, and go to a place and a tab."""
     client.open(str(recording.resolve()))
     until = time.monotonic() + _LOAD_S
     while client.get_state().loading:
         if process.poll() is not None or time.monotonic() > until:
             raise _ViewerGone
         time.sleep(0.1)
-    client.set_time(TIMELINE, sequence=station, play_state="paused")
+    if blueprint != BLUEPRINTS[0]:
+        open_tab(client, BLUEPRINTS.index(blueprint))
+    client.set_time(timeline, sequence=at, play_state="paused")
+
+
+def _when_still(client: Any) -> bytes:
+    """A PNG of the whole viewer, once nothing moves in it any more."""
+    until = time.monotonic() + _LOAD_S
+    same, last = 0, b""
+    while same < _STILL and time.monotonic() < until:
+        time.sleep(_SETTLE_S)
+        picture = bytes(client.take_screenshot())
+        same = same + 1 if picture == last else 1
+        last = picture
+    return last

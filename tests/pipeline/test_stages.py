@@ -84,6 +84,8 @@ def test_the_recording_holds_the_numbers_of_the_evaluation(session):
         assert numbers[name] == [row[name] for row in positions]
     assert numbers["stations"] == [row["station"] for row in positions]
     assert numbers["worst_station"] == track["worst_station"]
+    # Closed form, each camera alone, all cameras, everything together.
+    assert numbers["step_count"] == 4
 
 
 def test_the_recording_opens_without_a_view_error(session, tmp_path):
@@ -97,7 +99,7 @@ def test_the_recording_opens_without_a_view_error(session, tmp_path):
     for channel in range(3):
         others = [c for c in range(3) if c != channel]
         pure = (seen[..., channel] > 200) & (seen[..., others].max(axis=2) < 60)
-        assert pure.sum() > 50
+        assert pure.sum() > 20
 
 
 def test_the_track_is_accurate_and_adds_up(session):

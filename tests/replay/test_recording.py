@@ -11,6 +11,7 @@ import pytest
 import rerun as rr
 from finished_session import (
     BASE_FROM_WORLD,
+    evaluation,
     finished,
     mechanism,
     photograph,
@@ -21,8 +22,10 @@ from rerun.chunk import RrdReader
 
 from handeye_tri.errors import InputError, StorageError
 from handeye_tri.records import TrackEvaluation
-from handeye_tri.replay import write_recording
+from handeye_tri.replay import SolverStep, write_recording
 from handeye_tri.replay.recording import read_numbers
+from handeye_tri.replay.story import tell
+from handeye_tri.se3 import SE3
 
 
 def write(path, **changes):
@@ -37,7 +40,7 @@ def write(path, **changes):
         "calibration": done.calibration,
         "track": done.track,
         "truth": done.truth,
-        "verdict": "# PASS",
+        "evaluation": evaluation(done),
     }
     write_recording(path, **{**arguments, **changes})
     return done
@@ -50,7 +53,12 @@ def recording(tmp_path_factory):
     return path
 
 
-def column(path, entity, component):
+def told():
+    done = finished()
+    return done.session, done.calibration, done.track, done.truth
+
+
+def column(path, entity, component, timeline="station"):
     """Values by station; None is the key of what holds at all times."""
     found = {}
     for chunk in RrdReader(path).stream().filter(content=f"/{entity}").to_chunks():
@@ -60,8 +68,8 @@ def column(path, entity, component):
         values = batch.column(component).to_pylist()
         names = batch.schema.names
         when = (
-            batch.column("station").to_pylist()
-            if "station" in names
+            batch.column(timeline).to_pylist()
+            if timeline in names
             else [None] * len(values)
         )
         found.update(zip(when, values, strict=True))
@@ -100,6 +108,102 @@ def test_the_plotted_errors_are_the_evaluated_ones_to_the_bit(recording):
     for row, distance in enumerate(track.distances):
         found = plotted[int(track.stations[row])][int(track.markers[row])]
         assert found == 1e3 * distance
+
+
+def test_what_is_first_on_screen_is_the_worst_used_station(recording):
+    story = tell(*told())
+    shown = read_numbers(recording)["shown_station"]
+    used = np.where(story.held_out[:, None], -np.inf, story.distances_mm)
+    assert shown == story.shown == np.argmax(used.max(axis=1))
+    text = column(recording, "verdict", "TextDocument:text")[None][0]
+    marker, gap = story.worst(shown)
+    assert f"station {shown}**" in text
+    assert f"marker {marker} is {gap:.3f} mm off" in text
+
+
+def test_findings_stand_in_the_log_at_their_stations(tmp_path):
+    about = {"code": "SLIP", "cause": "the rig slipped", "evidence": "1.2 mm"}
+    about |= {"remedy": "tighten it", "camera": ""}
+    findings = [
+        {**about, "severity": "error", "stations": (4, 6)},
+        {**about, "severity": "note", "code": "FEW"},
+    ]
+    path = tmp_path / "replay.rrd"
+    write(path, evaluation={**evaluation(finished()), "findings": findings})
+    log = {}
+    for chunk in RrdReader(path).stream().filter(content="/log").to_chunks():
+        batch = chunk.to_record_batch()
+        if "station" not in batch.schema.names:
+            continue
+        for station, text, level in zip(
+            batch.column("station").to_pylist(),
+            batch.column("TextLog:text").to_pylist(),
+            batch.column("TextLog:level").to_pylist(),
+            strict=True,
+        ):
+            log.setdefault((station, level[0]), []).append(text[0])
+    told_ = "SLIP the rig slipped (1.2 mm). Do: tighten it."
+    assert told_ in log[4, "ERROR"]
+    assert told_ in log[6, "ERROR"]
+    assert (5, "ERROR") not in log
+    assert any(text.startswith("All stations: FEW") for text in log[0, "INFO"])
+    # And each station's worst marker.
+    marker, gap = tell(*told()).worst(5)
+    assert f"used: {marker} {gap:.3f} mm" in log[5, "INFO"]
+
+
+def test_frusta_slide_from_step_to_step_to_where_they_end(tmp_path):
+    done = finished()
+    off = SE3.exp([0.001, 0.0, -0.002, 0.0, 0.001, 0.0])
+    moved = replace(
+        done.calibration,
+        base_from_camera=tuple(m @ off for m in done.calibration.base_from_camera),
+    )
+    path = tmp_path / "replay.rrd"
+    steps = [SolverStep("closed form", moved)]
+    write(path, steps=steps)
+    story = tell(*told(), steps)
+    where = "cell/base/estimate/left"
+    places = column(path, where, "Transform3D:translation", "step")
+    end = done.calibration.base_from_camera[0]
+    drawn = end @ SE3.exp(story.magnification_slide * off.log())
+    assert np.allclose(places[0][0], drawn.translation, atol=1e-6)
+    assert np.allclose(places[1][0], end.translation, atol=1e-6)
+    by_station = column(path, where, "Transform3D:translation")
+    assert np.allclose(by_station[0][0], end.translation, atol=1e-6)
+    assert story.slides[0].moved_mm == pytest.approx(1e3 * np.hypot(0.001, 0.002))
+    assert story.slides[0].rms_px > 5 * story.slides[1].rms_px
+
+
+def test_ellipsoids_hold_95_percent_of_the_cameras_errors(recording):
+    story, covariance = tell(*told()), finished().calibration.covariance
+    sizes = column(
+        recording,
+        "cell/base/uncertainty/left/ellipsoid",
+        "Ellipsoids3D:half_sizes",
+    )[None][0]
+    assert np.allclose(sizes, story.ellipsoids[0].half_sizes, rtol=1e-6)
+    block = covariance.block([f"base_from_left.{axis}" for axis in "xyz"])
+    errors = np.random.default_rng(0).multivariate_normal(np.zeros(3), block, 20_000)
+    turned = story.magnification_ellipsoid * errors @ story.ellipsoids[0].rotation
+    inside = ((turned / story.ellipsoids[0].half_sizes) ** 2).sum(axis=1) <= 1
+    assert inside.mean() == pytest.approx(0.95, abs=0.006)
+
+
+def test_the_track_has_its_own_timeline(recording):
+    stations = finished().session.indices("evaluation")
+    path = f"cell/robot/{rr.escape_entity_path_part('link/1 t')}"
+    moved = column(recording, path, "Transform3D:translation", "track")
+    expected = world_from_body(finished().session)[stations, 2, :3, 3]
+    for k, place in enumerate(expected):
+        assert np.allclose(moved[k][0], place, atol=1e-6)
+
+
+def test_letters_stand_at_the_ends_of_the_half_turn_lines(recording):
+    labels = column(
+        recording, "cell/base/estimate/left/half_turn/letters", "Points2D:labels"
+    )
+    assert labels[0] == ["A", "A'", "B", "B'", "C", "C'"]
 
 
 def test_read_back_as_a_table_by_the_catalog(recording):
@@ -173,7 +277,8 @@ def test_the_same_input_gives_the_same_recording(recording, tmp_path):
     )
     assert compared.returncode == 0, compared.stderr
     # The comparison does see a difference where there is one.
-    write(tmp_path / "other.rrd", verdict="# FAIL")
+    other = {**evaluation(finished()), "verdict": "FAIL"}
+    write(tmp_path / "other.rrd", evaluation=other)
     compared = subprocess.run(
         [tool, "rrd", "compare", "--unordered", recording, tmp_path / "other.rrd"],
         capture_output=True,

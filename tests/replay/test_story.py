@@ -11,14 +11,10 @@ from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
 from handeye_tri.errors import InputError
 from handeye_tri.evaluate import cross_validate
 from handeye_tri.evaluate.resampling import drawn
+from handeye_tri.replay.half_turns import HalfTurnView, half_turn_view
 from handeye_tri.replay.shapes import vertex_normals
-from handeye_tri.replay.story import (
-    HalfTurnView,
-    _half_turn,
-    tell,
-    verdict_markdown,
-    worst_station,
-)
+from handeye_tri.replay.story import tell, worst_station
+from handeye_tri.replay.words import verdict_markdown
 from handeye_tri.triangle import AXES
 
 
@@ -85,7 +81,7 @@ def test_half_turn_lines_bend_with_the_lens():
     before = np.array([[100.0, 100.0], [300.0, 80.0], [200.0, 250.0]])
     after = 2 * np.array([250.0, 200.0]) - before
     ideal = straight.normalised(np.stack([before, after]))
-    view = _half_turn(bent, *bent.pixels(ideal), "normal")
+    view = half_turn_view(bent, *bent.pixels(ideal), "normal")
     centre = bent.pixels(straight.normalised(np.array([250.0, 200.0])))
     assert np.allclose(view.centre, centre, atol=1e-6)
     for line in view.lines:
@@ -110,7 +106,7 @@ def test_an_unseen_marker_leaves_the_rest():
     camera = PinholeCamera("c", Intrinsics(900, 900, 0, 512, 384), (1024, 768))
     before = np.array([[100.0, 100.0], [300.0, 80.0], [np.nan, np.nan]])
     after = np.array([[400.0, 300.0], [200.0, 320.0], [300.0, 150.0]])
-    view = _half_turn(camera, before, after, "normal")
+    view = half_turn_view(camera, before, after, "normal")
     assert isinstance(view, HalfTurnView)
     assert len(view.lines) == 2
     assert np.allclose(view.centre, [250.0, 200.0])
@@ -154,6 +150,17 @@ def test_worst_station_is_the_one_with_the_largest_error():
     assert worst_station(done.track) == done.track.stations[row]
 
 
+def test_without_a_used_station_the_worst_held_out_is_shown():
+    done = finished()
+    pixels = done.session.pixels.copy()
+    pixels[0, list(done.session.indices("calibration"))] = np.nan
+    covariance = done.session.pixel_covariance.copy()
+    covariance[~np.isfinite(pixels).all(axis=-1)] = np.nan
+    session = replace(done.session, pixels=pixels, pixel_covariance=covariance)
+    story = tell(session, done.calibration, done.track, None)
+    assert story.shown == worst_station(done.track)
+
+
 def test_normals_of_a_tetrahedron_point_outward():
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -177,7 +184,10 @@ def test_the_verdict_names_station_gates_and_source():
             **{"predicted_rms_mm": 0.5, "worst_station": 24, "worst_marker": "B"},
         },
     }
-    text = verdict_markdown(evaluation)
-    assert text.startswith("# FAIL\n1 of 2 gates met, 1 not run. REAL robot.")
-    for part in ("station 24", "marker B", "**LOOP** noise (1.9). Do: look."):
+    done = finished()
+    text = verdict_markdown(evaluation, story_of(done), done.track)
+    # The verdict and what is wrong come before the numbers.
+    assert text.startswith("# FAIL\nWithin 2 mm.\n\n**LOOP** noise (1.9). Do: look.")
+    worst = worst_station(done.track)
+    for part in ("1 of 2 gates met, 1 not run", "REAL", f"worst at station {worst}"):
         assert part in text

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from finished_session import (
     BASE_FROM_WORLD,
+    evaluation,
     finished,
     mechanism,
     photograph,
@@ -17,7 +18,14 @@ from finished_session import (
 from PIL import Image
 
 from handeye_tri.errors import HandEyeError, InputError, MissingDependencyError
-from handeye_tri.replay import open_viewer, screenshot, serve, viewer, write_recording
+from handeye_tri.replay import (
+    BLUEPRINTS,
+    open_viewer,
+    screenshot,
+    serve,
+    viewer,
+    write_recording,
+)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +43,7 @@ def recording(tmp_path_factory):
         calibration=done.calibration,
         track=done.track,
         truth=done.truth,
-        verdict="# PASS\nA sentence.",
+        evaluation=evaluation(done),
     )
     return path
 
@@ -63,7 +71,8 @@ def test_views_have_no_errors_and_show_used_and_held_out(
     recording, processes, tmp_path
 ):
     pictures = {}
-    for station in (None, 0):
+    last = len(finished().session.stations) - 1
+    for station in (last, None):
         path = tmp_path / f"{station}.png"
         assert screenshot(recording, path, size=(1200, 800), station=station) == []
         image = Image.open(path)
@@ -71,11 +80,31 @@ def test_views_have_no_errors_and_show_used_and_held_out(
         pictures[station] = np.asarray(image.convert("RGB")).astype(int)
     # The images fill a third of the picture: held out with orange rings, used blue.
     rings = {key: picture[:, 560:950] for key, picture in pictures.items()}
-    assert share(rings[None], (255, 149, 0)) > 3 * share(rings[0], (255, 149, 0))
-    assert share(rings[0], (64, 156, 255)) > 3 * share(rings[None], (64, 156, 255))
+    assert share(rings[last], (255, 149, 0)) > 3 * share(rings[None], (255, 149, 0))
+    assert share(rings[None], (64, 156, 255)) > 3 * share(rings[last], (64, 156, 255))
     # The arm, the images and the text are there: not one dark surface.
-    assert pictures[0].std() > 30
+    assert pictures[None].std() > 30
     assert [process.poll() is not None for process in processes] == [True, True]
+
+
+@pytest.mark.parametrize("blueprint", BLUEPRINTS[1:])
+def test_every_blueprint_draws_without_errors(recording, tmp_path, blueprint):
+    pictures = {}
+    for name in ("overview", blueprint):
+        path = tmp_path / f"{name}.png"
+        assert screenshot(recording, path, size=(1200, 800), blueprint=name) == []
+        pictures[name] = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    changed = np.abs(pictures[blueprint] - pictures["overview"]).max(axis=-1) > 30
+    assert changed.mean() > 0.15
+
+
+def test_a_blueprint_or_step_that_is_not_there_is_refused(recording, tmp_path):
+    with pytest.raises(InputError, match="blueprint 'x' is not in .*overview"):
+        screenshot(recording, tmp_path / "x.png", blueprint="x")
+    with pytest.raises(InputError, match="step 1 is not in .*0 to 0"):
+        screenshot(recording, tmp_path / "x.png", step=1)
+    with pytest.raises(InputError, match="not both"):
+        screenshot(recording, tmp_path / "x.png", step=0, station=0)
 
 
 def test_a_station_that_is_not_there_is_refused_before_anything_starts(
