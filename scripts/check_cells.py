@@ -35,6 +35,7 @@ LIMITS = {
     "hp3_stereo_edge": (0.082, 0.052, 0.036),
     "hp3_stereo_lens": (0.082, 0.047, 0.032),
     "hp3_stereo_mono": (None, None, None),
+    "hp3_single": (None, None, None),
 }
 RATIO = (0.90, 1.10)
 CHI2 = (0.85, 1.10)

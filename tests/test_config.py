@@ -267,7 +267,7 @@ UNKNOWN = "this key is not known here"
             "sides [0.25, -0.05, 0.23] m",
         ),
         # Cameras.
-        (drop("cameras", 1), "cameras: at least 2 are needed, got 1"),
+        (put("cameras", []), "cameras: at least 1 is needed, got 0"),
         (put("cameras", 0, 3), "cameras.0: this must be a mapping of keys, got 3"),
         (
             put("cameras", 1, "name", "left"),

@@ -317,7 +317,7 @@ class CellToCalibrate(_Model):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
     arm: RobotAccuracy
     rig: TriangleConfig
-    cameras: tuple[CameraToCalibrate, ...] = Field(min_length=2)
+    cameras: tuple[CameraToCalibrate, ...] = Field(min_length=1)
     plan: MotionConfig = MotionConfig()
     track_limit_mm: Positive = 1.0
 
@@ -349,7 +349,7 @@ class Cell(CellToCalibrate):
     schema_: Literal["handeye_tri.cell/1"] = Field(alias="schema")
     arm: ArmConfig
     rig: RigConfig
-    cameras: tuple[CameraConfig, ...] = Field(min_length=2)
+    cameras: tuple[CameraConfig, ...] = Field(min_length=1)
     imaging: ImagingConfig = ImagingConfig()
     surroundings: tuple[BoxConfig, ...] = ()
     plan: PlanConfig

@@ -122,7 +122,8 @@ def _explain(error: ErrorDetails) -> str:
     value = value if len(value) <= 60 else f"{value[:57]}..."
     if kind == "too_short":
         least = error["ctx"]["min_length"]
-        return f"at least {least} are needed, got {error['ctx']['actual_length']}"
+        verb = "is" if least == 1 else "are"
+        return f"at least {least} {verb} needed, got {error['ctx']['actual_length']}"
     if kind in ("model_type", "dict_type"):
         return f"this must be a mapping of keys, got {value}"
     return f"{text[0].lower()}{text[1:]}, got {value}"

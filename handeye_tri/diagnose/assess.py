@@ -29,7 +29,7 @@ from handeye_tri.records import (
     Session,
     TrackEvaluation,
 )
-from handeye_tri.se3 import so3_log
+from handeye_tri.se3 import se3_inverse, so3_log
 
 Floats = NDArray[np.float64]
 
@@ -165,6 +165,9 @@ def free_scale(
         session.pixels[:, stations],
         session.pixel_covariance[:, stations],
         session.marker_radii,
+        start=se3_inverse(calibration.base_from_camera[0].matrix)
+        @ session.base_from_flange[stations]
+        @ calibration.flange_from_triangle.matrix,
     )
     flange = session.base_from_flange[stations[observed.views]]
     poses = observed.reference_from_triangle

@@ -18,6 +18,7 @@ from handeye_tri.evaluate.derivatives import (
     markers_by_parameters,
     observed_by_parameters,
 )
+from handeye_tri.evaluate.one_view import seen_by_one
 from handeye_tri.records import HandEyeCalibration, Session, TrackEvaluation
 
 Floats = NDArray[np.float64]
@@ -70,6 +71,8 @@ class _Rows:
     Attributes:
         track: The r rows.
         parts: Covariance by calibration, pixels, robot, shape (3, r, 3, 3), m^2.
+        seen: Root of the pixels' part: of two rows of a station, ``seen_i seen_j'``
+            is their common covariance, shape (r, 3, 9), m.
         by_parameters: Derivative of observed less reported by the calibration's
             parameters, shape (r, 3, p).
         moved: Derivative of reported by the flange's right tangent, (r, 3, 6).
@@ -77,6 +80,7 @@ class _Rows:
 
     track: TrackEvaluation
     parts: Floats
+    seen: Floats
     by_parameters: Floats
     moved: Floats
 
@@ -102,7 +106,8 @@ def evaluate_track(
 
     The robot's track is its reported pose applied to the calibrated markers; the
     cameras' track is the maximum-likelihood triangulation, corrected for sphere
-    eccentricity (as Fig. 12 of Zhao, Liu and Zhang 2008). The predicted covariance
+    eccentricity (as Fig. 12 of Zhao, Liu and Zhang 2008); a cell's only camera places
+    the calibrated triangle as a whole, by its three points. The predicted covariance
     of observed less reported holds the calibration's covariance, the pixels' and
     the robot's repeatability; rows of the same calibration are correlated, and the
     covariances of single rows do not show it.
@@ -115,8 +120,8 @@ def evaluate_track(
             corrected by them.
 
     Raises:
-        InputError: the cameras do not fit, nothing was seen by two of them, or
-            robot_parameters are missing.
+        InputError: the cameras do not fit, nothing was seen by two of them (or by
+            the only one), or robot_parameters are missing.
     """
     return _evaluate(calibration, session, robot_parameters).track
 
@@ -157,9 +162,8 @@ def against_prediction(
         mine = np.flatnonzero(track.stations == station)
         by_parameters = rows.by_parameters[mine].reshape(-1, p)
         moved = rows.moved[mine].reshape(-1, 6)
-        own = moved @ session.repeatability.covariance @ moved.T
-        for k, row in enumerate(mine):
-            own[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += rows.parts[1, row]
+        seen = rows.seen[mine].reshape(-1, 9)
+        own = moved @ session.repeatability.covariance @ moved.T + seen @ seen.T
         every += by_parameters.T @ by_parameters
         weighed += by_parameters.T @ own @ by_parameters
         square += float((own * own).sum())
@@ -190,8 +194,48 @@ def _evaluate(
             f"the calibration has cameras ({', '.join(names)}), the session "
             f"({', '.join(expected)}); evaluate with the session it was made from"
         )
+    poses, by_robot = _reported_poses(calibration, session, robot_parameters)
+    observed = (
+        _triangulated(calibration, session)
+        if len(names) > 1
+        else _from_one_view(calibration, session, poses)
+    )
+    station, marker = observed.station, observed.marker
+    rotation = poses[station, :3, :3]
+    markers = calibration.markers[marker]
+    reported = np.einsum("rab,rb->ra", rotation, markers) + poses[station, :3, 3]
+    moved = rotation @ by_tangent(markers)
+    by_parameters = observed.by_parameters
+    by_parameters -= rotation @ markers_by_parameters(calibration)[marker]
+    by_parameters -= moved @ by_robot[station]
+    parts = np.stack(
+        [
+            by_parameters @ calibration.covariance.matrix @ by_parameters.mT,
+            observed.seen @ observed.seen.mT,
+            moved @ session.repeatability.covariance @ moved.mT,
+        ]
+    )
+    track = TrackEvaluation(
+        station, marker, reported, observed.points, parts.sum(axis=0)
+    )
+    return _Rows(track, parts, observed.seen, by_parameters, moved)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Observed:
+    """The cameras' track: rows of station and marker, see :class:`_Rows`."""
+
+    station: NDArray[np.intp]
+    marker: NDArray[np.intp]
+    points: Floats
+    by_parameters: Floats
+    seen: Floats
+
+
+def _triangulated(calibration: HandEyeCalibration, session: Session) -> _Observed:
+    """Each marker by itself, where two cameras see it."""
     stations = session.indices("evaluation")
-    m, n = len(names), len(stations)
+    m, n = len(session.cameras), len(stations)
     pixels = session.pixels[:, stations].reshape(m, 3 * n, 2)
     noise = session.pixel_covariance[:, stations].reshape(m, 3 * n, 2, 2)
     points, covariance = _observe(
@@ -199,25 +243,41 @@ def _evaluate(
     )
     rows = np.flatnonzero(np.isfinite(points).all(axis=1))
     station, marker = np.repeat(stations, 3)[rows], np.tile(np.arange(3), n)[rows]
-    poses, by_robot = _reported_poses(calibration, session, robot_parameters)
-    rotation = poses[station, :3, :3]
-    markers = calibration.markers[marker]
-    reported = np.einsum("rab,rb->ra", rotation, markers) + poses[station, :3, 3]
-    moved = rotation @ by_tangent(markers)
-    by_parameters = observed_by_parameters(
-        calibration, points[rows], covariance[rows], noise[:, rows]
+    seen = np.zeros((len(rows), 3, 3, 3))
+    seen[np.arange(len(rows)), :, marker] = np.linalg.cholesky(covariance[rows])
+    return _Observed(
+        station,
+        marker,
+        points[rows],
+        observed_by_parameters(
+            calibration, points[rows], covariance[rows], noise[:, rows]
+        ),
+        seen.reshape(len(rows), 3, 9),
     )
-    by_parameters -= rotation @ markers_by_parameters(calibration)[marker]
-    by_parameters -= moved @ by_robot[station]
-    parts = np.stack(
-        [
-            by_parameters @ calibration.covariance.matrix @ by_parameters.mT,
-            covariance[rows],
-            moved @ session.repeatability.covariance @ moved.mT,
-        ]
+
+
+def _from_one_view(
+    calibration: HandEyeCalibration, session: Session, poses: Floats
+) -> _Observed:
+    """The triangle as a whole, where the only camera sees all of it."""
+    stations = session.indices("evaluation")
+    found = seen_by_one(
+        calibration,
+        session.pixels[0, stations],
+        session.pixel_covariance[0, stations],
+        session.marker_radii,
+        poses[stations],
     )
-    track = TrackEvaluation(station, marker, reported, points[rows], parts.sum(axis=0))
-    return _Rows(track, parts, by_parameters, moved)
+    s, p = len(found.views), found.by_parameters.shape[-1]
+    seen = np.zeros((3 * s, 3, 9))
+    seen[..., :6] = found.by_pixels.reshape(-1, 3, 6)
+    return _Observed(
+        np.repeat(stations[found.views], 3),
+        np.tile(np.arange(3), s),
+        found.points.reshape(-1, 3),
+        found.by_parameters.reshape(-1, 3, p),
+        seen,
+    )
 
 
 def _reported_poses(

@@ -14,6 +14,7 @@ from handeye_tri.evaluate.derivatives import (
     markers_by_parameters,
     observed_by_parameters,
 )
+from handeye_tri.evaluate.one_view import fixed_by_view, markers_by_view
 from handeye_tri.records import HandEyeCalibration, Repeatability, Session
 
 Floats = NDArray[np.float64]
@@ -26,7 +27,8 @@ class TrackMap:
     Attributes:
         points: Of the grid in the base, shape (a, b, c, 3), metres.
         covariance: Of observed less reported position of a marker there, shape
-            (a, b, c, 3, 3), m^2; NaN where fewer than two cameras see it.
+            (a, b, c, 3, 3), m^2; NaN where fewer than two cameras see it (or the
+            only one, whatever the orientation).
     """
 
     points: Floats
@@ -49,7 +51,8 @@ def predicted_track_error(
     """Covariance of a marker's observed less reported position anywhere.
 
     Averaged over the three markers and over the flange's orientations, since how an
-    error of the markers in the flange shows depends on them. Errors of estimated
+    error of the markers in the flange shows depends on them; with a single camera, over
+    those orientations at which its view fixes the triangle's pose. Errors of estimated
     parameters of the robot are left out: they depend on its joints, not on where
     the marker is.
 
@@ -61,7 +64,8 @@ def predicted_track_error(
         repeatability: The robot's; None for the calibration's part alone.
 
     Returns:
-        Shape (..., 3, 3), m^2; NaN where the point is in fewer than two images.
+        Shape (..., 3, 3), m^2; NaN where the point is in fewer than two images, or a
+        single camera does not fix the triangle at any orientation.
 
     Raises:
         InputError: a shape does not fit.
@@ -75,6 +79,9 @@ def predicted_track_error(
             f"orientations must have shape (q, 3, 3), q at least 1, got {turns.shape}"
         )
     flat = where.reshape(-1, 3)
+    if len(calibration.cameras) == 1:
+        result = _by_one_view(calibration, flat, turns, sigma_px, repeatability)
+        return result.reshape(*where.shape, 3)
     pixels = np.full((len(calibration.cameras), len(flat), 2), np.nan)
     for i, camera in enumerate(calibration.cameras):
         seen = camera.project(calibration.base_from_camera[i].inverse().apply(flat))
@@ -107,6 +114,35 @@ def predicted_track_error(
             spread = moved @ repeatability.covariance @ moved.mT
             result[rows] += spread.mean(axis=(0, 1))
     return result.reshape(*where.shape, 3)
+
+
+def _by_one_view(
+    calibration: HandEyeCalibration,
+    points: Floats,
+    turns: Floats,
+    sigma_px: float,
+    repeatability: Repeatability | None,
+) -> Floats:
+    """The same before a single camera, at points (k, 3): shape (k, 3, 3), m^2."""
+    matrix = calibration.covariance.matrix
+    total, count = np.zeros((len(points), 3, 3)), np.zeros(len(points))
+    by_markers = markers_by_parameters(calibration)
+    by_error = by_tangent(calibration.markers)
+    for turn in turns:
+        for k, marker in enumerate(calibration.markers):
+            poses = np.tile(np.eye(4), (len(points), 1, 1))
+            poses[:, :3, :3], poses[:, :3, 3] = turn, points - turn @ marker
+            rows = np.flatnonzero(fixed_by_view(calibration, poses))
+            seen, by_pixels = markers_by_view(calibration, poses[rows])
+            caused = seen[:, k] - turn @ by_markers[k]
+            total[rows] += caused @ matrix @ caused.mT
+            total[rows] += sigma_px**2 * by_pixels[:, k] @ by_pixels[:, k].mT
+            if repeatability is not None:
+                moved = turn @ by_error[k]
+                total[rows] += moved @ repeatability.covariance @ moved.T
+            count[rows] += 1
+    with np.errstate(invalid="ignore"):
+        return np.asarray(total / count[:, None, None])
 
 
 def track_map(

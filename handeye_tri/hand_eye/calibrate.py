@@ -59,7 +59,7 @@ def calibrate_hand_eye(
 
     Raises:
         InputError: cameras and session do not fit, or fewer than three calibration
-            stations show all markers to two cameras.
+            stations show all markers to two cameras (or to the only one).
         DegenerateMotionError: the stations do not determine the motions.
         ConvergenceError: an iteration did not settle.
     """
@@ -81,11 +81,13 @@ def calibrate_hand_eye(
         session.pixels[:, stations],
         session.pixel_covariance[:, stations],
         session.marker_radii,
+        start=_rough(cameras, stations),
     )
     if len(observed.views) < 3:
         raise InputError(
             f"only {len(observed.views)} of {len(stations)} calibration stations show "
-            "all three markers to two cameras; at least 3 are needed"
+            "all three markers to two cameras (or to the only one, in a half-turn); at "
+            "least 3 are needed"
         )
     a = session.base_from_flange[stations[observed.views]]
     b = observed.reference_from_triangle
@@ -112,6 +114,14 @@ def calibrate_hand_eye(
         method="AX=ZB: Shah, then maximum likelihood",
         alternatives=_alternatives(a, b),
     )
+
+
+def _rough(
+    cameras: CameraCalibration, stations: NDArray[np.intp]
+) -> NDArray[np.float64] | None:
+    """Where the cameras' calibration left the triangle, (n, 4, 4), if it says so."""
+    poses = cameras.details.get("reference_from_triangle")
+    return None if poses is None else np.asarray(poses[stations])
 
 
 def _joint_covariance(

@@ -32,7 +32,8 @@ class ObservedPoses:
     """The triangle in the reference camera's frame.
 
     Attributes:
-        views: Which of the given views had all three markers in two cameras, (s,).
+        views: Which of the given views had all three markers in two cameras (or in
+            the only one), shape (s,).
         reference_from_triangle: Shape (s, 4, 4), metres.
         covariance: Of the right tangents, from the pixels alone, (s, 6, 6).
         by_cameras: Derivative of the right tangents by the calibration's parameters
@@ -53,13 +54,14 @@ def triangle_poses(
     pixels: ArrayLike,
     covariance: ArrayLike,
     marker_radii: ArrayLike = (0.0, 0.0, 0.0),
+    start: ArrayLike | None = None,
 ) -> ObservedPoses:
     """Pose of the known triangle at every view, from all cameras at once.
 
     The start is the rigid Procrustes fit of the triangle to its triangulated points
     (Zhao, Liu and Zhang 2008, Sec. III-D); Gauss-Newton on the whitened pixels
-    follows. Six numbers from twelve pixel coordinates of two cameras. One camera
-    alone is not enough: its three points leave several poses (P3P).
+    follows. Six numbers from twelve pixel coordinates of two cameras. The three
+    points of a single camera leave several poses (P3P): ``start`` says which is meant.
 
     The derivative by the cameras' parameters c comes from the optimum's condition
     ``J' W (pixels - predicted(T, c)) = 0``: ``dT = -(J' W J)^-1 J' W (d predicted /
@@ -72,10 +74,12 @@ def triangle_poses(
         covariance: Shape (m, n, 3, 2, 2), px^2.
         marker_radii: Shape (3,), metres; the shift of a sphere's outline against
             its centre is taken off the pixels.
+        start: With a single camera: reference_from_triangle roughly, shape (n, 4, 4),
+            NaN where it is not known and the view is left out.
 
     Raises:
-        InputError: the shapes do not fit, or no view has all three markers in two
-            cameras.
+        InputError: the shapes do not fit, no view has all three markers in two
+            cameras, or a single camera has no start.
         ConvergenceError: a view did not converge.
     """
     observed = np.array(pixels, dtype=float)
@@ -91,17 +95,30 @@ def triangle_poses(
             f"covariance must have shape {(*observed.shape, 2)}, got {noise.shape}"
         )
     seen = np.isfinite(observed).all(axis=-1)
-    views = np.flatnonzero((seen.sum(axis=0) >= 2).all(axis=1))
+    usable = np.asarray((seen.sum(axis=0) >= min(2, m)).all(axis=1))
+    if m == 1:
+        if start is None:
+            raise InputError(
+                "the three points of a single camera leave several poses of the "
+                "triangle; give start, which says roughly where it is"
+            )
+        rough = np.asarray(start, dtype=float)
+        usable &= np.isfinite(rough).all(axis=(1, 2))
+    views = np.flatnonzero(usable)
     if len(views) == 0:
         raise InputError(
             f"none of the {observed.shape[1]} views shows all three markers to two "
-            "cameras; a triangle's pose needs that (one camera leaves several poses)"
+            "cameras (or to the only one, at a station whose pose is known roughly)"
         )
     observed, seen = observed[:, views], seen[:, views]
     weight = np.zeros((m, len(views), 3, 2, 2))
     weight[seen] = np.linalg.inv(noise[:, views][seen])
     radii = np.asarray(marker_radii, dtype=float)
-    poses = _procrustes(triangle, cameras, observed, noise[:, views])
+    poses = (
+        rough[views]
+        if m == 1
+        else _procrustes(triangle, cameras, observed, noise[:, views])
+    )
     poses = _refine(triangle, cameras, poses, observed, weight, views)
     for _ in range(_CORRECTIONS if radii.any() else 0):
         corrected = observed.copy()

@@ -83,6 +83,9 @@ def read_results(run: Run, frames: FrameNames) -> Results:
         session.pixels,
         session.pixel_covariance,
         session.marker_radii,
+        start=se3_inverse(hand_eye.base_from_camera[0].matrix)
+        @ session.base_from_flange
+        @ hand_eye.flange_from_triangle.matrix,
     )
     return Results(
         cell=run.cell.name,

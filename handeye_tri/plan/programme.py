@@ -46,9 +46,9 @@ def plan_motions(
     """Plan half-turns joined by general motions, then evaluation stations.
 
     Every station is within the joint limits, free of collision with clearance, and
-    shows all markers' outlines unhidden and with margin to two cameras or more, at an
-    allowed tilt; the two stations of a half-turn differ by 180 degrees about the
-    flange's z axis; successive half-turns' planes enclose at least
+    shows all markers' outlines unhidden and with margin to two cameras or more (or to
+    the only one), at an allowed tilt; the two stations of a half-turn differ by 180
+    degrees about the flange's z axis; successive half-turns' planes enclose at least
     ``plan.min_plane_spread_deg`` (Zhao, Liu and Zhang 2008, Proposition 1,
     doi:10.1109/TIP.2008.2005562); ways from station to station are free, straight in
     joint space or past the points in ``via``. Among what passes, those half-turns

@@ -152,13 +152,14 @@ class GroundTruth:
 class TrackEvaluation:
     """Robot-reported against observed marker positions at held-out stations.
 
-    Rows are markers seen by at least two cameras, station by station.
+    Rows are markers seen by at least two cameras, station by station; with one camera
+    in the cell, those of stations at which it saw all three.
 
     Attributes:
         stations: Station index of each row, shape (r,).
         markers: Marker index 0, 1, 2 of each row, shape (r,).
         reported: base_from_flange (reported) applied to the markers, (r, 3), m.
-        observed: Triangulated positions in base, (r, 3), m.
+        observed: Where the cameras see them in the base, (r, 3), m.
         predicted_covariance: Of observed - reported, shape (r, 3, 3), m^2.
     """
 
@@ -173,8 +174,8 @@ class TrackEvaluation:
         r = len(self.stations)
         if r == 0:
             raise InputError(
-                "no marker of a held-out station was seen by two cameras; "
-                "the track cannot be evaluated"
+                "no marker of a held-out station was seen by two cameras (nor all "
+                "three by a cell's only camera); the track cannot be evaluated"
             )
         for name in ("stations", "markers"):
             rows = np.array(getattr(self, name), dtype=np.intp)

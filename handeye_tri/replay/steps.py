@@ -119,7 +119,8 @@ def used_track(
         replace(station, kind=kinds[station.kind])  # type: ignore[arg-type]
         for station in session.stations
     )
-    seen = np.isfinite(session.pixels).all(axis=-1).sum(axis=0) >= 2
+    enough = min(2, len(session.cameras))
+    seen = np.isfinite(session.pixels).all(axis=-1).sum(axis=0) >= enough
     if not seen[session.indices("calibration")].any():
         return None
     swapped = replace(session, stations=stations, half_turns=())

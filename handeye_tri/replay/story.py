@@ -64,7 +64,7 @@ class Story:
         held_out: Whether the calibration never saw the station, shape (n,).
         reported: Markers where the robot says that they are, shape (n, 3, 3), m.
         observed: Markers where the cameras see them, shape (n, 3, 3), m; NaN =
-            seen by fewer than two cameras.
+            seen by fewer than two cameras, or by less than all of the only one.
         actual: Markers where they truly were, (n, 3, 3), m; None without truth.
         predicted: Markers in the images by calibration and robot, their outline's
             centre, shape (m, n, 3, 2), pixels.

@@ -93,8 +93,8 @@ def workspace_map(points: Floats, covariance: Floats, radii_mm: Floats) -> str:
 
     Args:
         points: Grid at one height in the base, shape (a, b, 3), metres.
-        covariance: Of the error at each, shape (a, b, 3, 3), m^2; NaN = not seen by
-            two cameras.
+        covariance: Of the error at each, shape (a, b, 3, 3), m^2; NaN = not seen
+            by enough cameras.
         radii_mm: Radius that holds 95 % of the errors in space, shape (a, b), mm.
     """
     x, y = 1e3 * points[:, 0, 0], 1e3 * points[0, :, 1]

@@ -25,6 +25,8 @@ from handeye_tri.se3 import SE3, quaternion_wxyz, rotation_from_quaternion_wxyz
 
 Json = dict[str, Any]
 
+_POSES = "reference_from_triangle"
+
 
 def numbers(array: NDArray[np.float64]) -> Any:
     """Nested lists of an array of any shape; NaN becomes null."""
@@ -197,6 +199,7 @@ def truth_from_json(data: Mapping[str, Any]) -> tuple[GroundTruth, NDArray[np.fl
 
 def camera_calibration_to_json(result: CameraCalibration) -> Json:
     """Calibrated cameras with their covariance."""
+    poses = result.details.get(_POSES)
     return {
         "method": result.method,
         "cameras": [camera_to_json(camera) for camera in result.cameras],
@@ -210,6 +213,7 @@ def camera_calibration_to_json(result: CameraCalibration) -> Json:
         "covariance": covariance_to_json(result.covariance),
         "residuals_px": numbers(result.residuals),
         "dropped": [asdict(one) for one in result.details.get("dropped", ())],
+        _POSES: None if poses is None else numbers(poses),
     }
 
 
@@ -237,9 +241,23 @@ def camera_calibration_from_json(data: Mapping[str, Any]) -> CameraCalibration:
                     str(one["why"]),
                 )
                 for one in data.get("dropped", ())
-            )
+            ),
+            **_poses_from_json(data),
         },
     )
+
+
+def _poses_from_json(data: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
+    """Where the cameras saw the triangle, by station, where that was kept."""
+    if data.get(_POSES) is None:
+        return {}
+    poses = array(data[_POSES], _POSES)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        raise StorageError(
+            f"{_POSES} must have shape (n, 4, 4), got {poses.shape}; run "
+            "handeye-tri calibrate again"
+        )
+    return {_POSES: poses}
 
 
 def hand_eye_to_json(result: HandEyeCalibration) -> Json:
