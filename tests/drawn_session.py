@@ -94,11 +94,11 @@ def few_replicates() -> AbstractContextManager[object]:
 
 
 @cache
-def _made() -> Path:
+def _made(cell: str, seed: int) -> Path:
     parent = Path(mkdtemp(prefix="drawn-"))
     atexit.register(shutil.rmtree, parent, ignore_errors=True)
     folder = parent / "session"
-    run = Run(start("hp3_stereo", folder, 3, 6), NullProgress())
+    run = Run(start(cell, folder, seed, 6), NullProgress())
     execute(run, STAGES, ("plan",), again=False)
     stage = STAGES["simulate"]
     run.folder.record("simulate", inputs_of(run, stage), _simulate(run), "drawn")
@@ -107,10 +107,12 @@ def _made() -> Path:
     return folder
 
 
-def drawn_session(parent: Path) -> Run:
+def drawn_session(
+    parent: Path, *, cell: str = "hp3_stereo", seed: int = 3, name: str = "session"
+) -> Run:
     """A copy of a session of 6 half-turns and 6 held-out stations, evaluated."""
-    shutil.copytree(_made(), parent / "session")
-    return Run(storage.SessionFolder.open(parent / "session"), NullProgress())
+    shutil.copytree(_made(cell, seed), parent / name)
+    return Run(storage.SessionFolder.open(parent / name), NullProgress())
 
 
 def with_outcome(run: Run, outcome: str) -> Run:

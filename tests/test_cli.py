@@ -33,7 +33,17 @@ def test_help_fits_a_screen_and_has_an_example(capsys, verb):
     code, out, _ = call(capsys, verb, "--help")
     assert code == 0
     assert len(out.splitlines()) <= 30
+    assert max(map(len, out.splitlines())) <= 80
     assert f"handeye-tri {verb}" in out.split("Example:")[1]
+
+
+def test_the_help_of_all_verbs_fits_a_screen_and_is_not_cut_off(capsys):
+    code, out, _ = call(capsys, "--help")
+    assert code == 0
+    assert len(out.splitlines()) <= 30
+    assert max(map(len, out.splitlines())) <= 80
+    assert "handeye-tri run" in out.split("Example:")[1]
+    assert "...\n" not in out.split("Commands:")[1]
 
 
 def test_help_starts_without_heavy_modules():

@@ -10,6 +10,7 @@ import click
 
 # Each of these adds its verbs to the group.
 from handeye_tri.cli import (
+    compare,
     doctor,
     exchange,
     experiment,
@@ -24,6 +25,7 @@ from handeye_tri.errors import DegenerateMotionError, HandEyeError
 
 __all__ = [
     "commands",
+    "compare",
     "doctor",
     "exchange",
     "experiment",

@@ -39,7 +39,9 @@ def experiment(
     dask: str | None,
     images: Path | None,
 ) -> None:
-    """Do an experiment of the paper again: a table, a plot and a verdict.
+    """Do an experiment of the paper again.
+
+    Each leaves a table (CSV), a plot (SVG, PNG) and a line of verdict.
 
     NAME is a figure or table, or "paper" for all of them on one page. Trials that are
     in the folder are not done again.

@@ -63,7 +63,7 @@ def _conclude(run: Run, *, as_json: bool) -> None:
 def run(
     cell: str, output: Path, seed: int, half_turns: int | None, as_json: bool
 ) -> None:
-    """Plan, simulate, detect, calibrate, evaluate and report, on rendered images.
+    """Do everything, from plan to report, on rendered images.
 
     CELL is the path of a YAML file or a name in scenes/. What is already done in
     the folder is not done again unless its inputs changed.
@@ -110,9 +110,9 @@ def plan(
     as_json: bool,
     again: bool,
 ) -> None:
-    """Plan the robot's stations, and say what they promise before it moves.
+    """Plan the robot's stations, and say what they promise.
 
-    Reachable, visible, free of collision, and chosen for the least track error.
+    Before it moves: reachable, visible, free of collision, and chosen for the least track error.
     """
     import json
 
@@ -176,7 +176,7 @@ def _verb(name: str, text: str) -> None:
 
 _verb("simulate", "Execute the plan in the simulator and render every view.")
 _verb("detect", "Find the three markers in every image, with their covariance.")
-_verb("evaluate", "Compare the robot's and the cameras' track at held-out stations.")
+_verb("evaluate", "Compare the robot's track with the cameras', held out.")
 _verb("report", "Write the recording (replay.rrd) and report.html.")
 
 
@@ -216,7 +216,7 @@ def _robot_errors(
 def calibrate(
     session: Path, method: str, robot_errors: tuple[str, ...], again: bool
 ) -> None:
-    """Calibrate the cameras and where they and the markers are to the robot."""
+    """Calibrate the cameras, their places and the markers'."""
     from handeye_tri.storage import SessionFolder
 
     folder = SessionFolder.open(session)

@@ -58,7 +58,7 @@ def solve(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Solve bare pose pairs of any robot and any target, and judge them.
+    """Solve bare pose pairs of any robot and any target.
 
     POSES states mounting, directions and units; nothing is guessed (see
     scripts/README.md). Exit code: 0 PASS, 3 FAIL, 4 CANNOT TELL, 2 input not usable.

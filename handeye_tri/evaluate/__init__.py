@@ -1,6 +1,13 @@
 """How good a calibrated cell is: held-out track, budget, map, truth where known."""
 
 from handeye_tri.evaluate.budget import TrackBudget
+from handeye_tri.evaluate.change import (
+    PartChange,
+    PlacementChange,
+    as_reference,
+    part_changes,
+    placement_change,
+)
 from handeye_tri.evaluate.cross_validation import CrossValidation, cross_validate
 from handeye_tri.evaluate.repeatability import (
     Spread,
@@ -29,7 +36,10 @@ __all__ = [
     "Comparison",
     "CrossValidation",
     "LoopResiduals",
+    "PartChange",
+    "PlacementChange",
     "against_prediction",
+    "as_reference",
     "Spread",
     "TrackBudget",
     "TrackMap",
@@ -39,6 +49,8 @@ __all__ = [
     "cross_validate",
     "evaluate_track",
     "loop_residuals",
+    "part_changes",
+    "placement_change",
     "parametric_bootstrap",
     "predicted_track_error",
     "track_budget",

@@ -15,6 +15,7 @@ from handeye_tri.errors import (
     DegenerateMotionError,
     InputError,
 )
+from handeye_tri.evaluate.change import as_reference
 from handeye_tri.evaluate.resampling import (
     Progress,
     Recalibrate,
@@ -25,7 +26,7 @@ from handeye_tri.evaluate.resampling import (
 from handeye_tri.evaluate.track import track_budget
 from handeye_tri.evaluate.truth import compare_with_truth
 from handeye_tri.evaluate.views import predicted_pixels
-from handeye_tri.records import Covariance, GroundTruth, HandEyeCalibration, Session
+from handeye_tri.records import Covariance, HandEyeCalibration, Session
 from handeye_tri.se3 import SE3
 from handeye_tri.triangle import EDGES
 
@@ -227,14 +228,8 @@ def _change(whole: HandEyeCalibration, other: HandEyeCalibration) -> dict[str, f
     Labels are those of the whole's covariance, and "baseline.<camera>"; motions change
     by the right tangent, as in the covariance.
     """
-    reference = GroundTruth(
-        whole.cameras,
-        whole.base_from_camera,
-        whole.flange_from_triangle,
-        np.empty((0, 4, 4)),
-        whole.markers,
-    )
-    change = {row.quantity: row.error for row in compare_with_truth(other, reference)}
+    rows = compare_with_truth(other, as_reference(whole))
+    change = {row.quantity: row.error for row in rows}
     for label, value in whole.robot.items():
         # What another part of the data cannot determine is left at zero there.
         change[label] = other.robot.get(label, 0.0) - value
