@@ -236,4 +236,4 @@ def test_what_to_add_needs_something_detected(capsys, tmp_path):
     call(capsys, "plan", session, "--cell", "hp3_stereo", "--half-turns", 2)
     code, _, err = call(capsys, "plan", session, "--next", 2)
     assert code == 2
-    assert f"handeye-tri detect {session}" in err
+    assert f"handeye-tri simulate {session}" in err

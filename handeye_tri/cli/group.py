@@ -24,4 +24,4 @@ def example(*lines: str) -> str:
 )
 @click.version_option(package_name="handeye-tri")
 def commands() -> None:
-    """Calibrate cameras and a robot arm with three markers that turn by 180 degrees."""
+    """Calibrate cameras and an arm with three markers that turn by 180 degrees."""

@@ -40,12 +40,12 @@ def programme(
     FORMAT: csv (joints by station), json, joint_trajectory (ROS 2), urscript.
     """
     from handeye_tri.pipeline import NullProgress, Run
-    from handeye_tri.pipeline.programme import write_programme
+    from handeye_tri.pipeline.programme import planned_outcome, write_programme
     from handeye_tri.storage import SessionFolder
 
     cap_threads()
     run = Run(SessionFolder.open(session), NullProgress())
-    outcome = run.plan().outcome
+    outcome = planned_outcome(run)
     if outcome != "PASS" and not even_if_failed:
         click.echo(
             f"error: {session}: the plan's verdict is {outcome}, so no programme is "

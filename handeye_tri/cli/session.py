@@ -112,7 +112,8 @@ def plan(
 ) -> None:
     """Plan the robot's stations, and say what they promise.
 
-    Before it moves: reachable, visible, free of collision, and chosen for the least track error.
+    Before it moves: reachable, visible, free of collision, and chosen for the least
+    track error.
     """
     import json
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from handeye_tri import storage
 from handeye_tri.errors import StorageError
-from handeye_tri.pipeline.run import Run
+from handeye_tri.pipeline.run import SCHEMAS, Run
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +41,7 @@ def inputs_of(run: Run, stage: Stage) -> str:
         {
             "stage": stage.name,
             "version": header["software"].get("handeye-tri"),
+            "schema": SCHEMAS.get(stage.name),
             "seed": header["seed"],
             "half_turns": header["half_turns"],
             "cell": {key: header["cell"].get(key) for key in stage.cell_keys},

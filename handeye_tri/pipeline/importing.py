@@ -204,7 +204,7 @@ def _folder(
     half_turns: int,
 ) -> SessionFolder:
     header: dict[str, Any] = {
-        "schema": "handeye_tri.session/1",
+        "schema": storage.SESSION_SCHEMA,
         "software": software(),
         "cell": cell.model_dump(mode="json", by_alias=True),
         "cell_file": cell_file,

@@ -14,7 +14,9 @@ from handeye_tri.exchange.robot_programme import (
     programme_json,
     urscript,
 )
+from handeye_tri.pipeline.execution import require
 from handeye_tri.pipeline.run import Run
+from handeye_tri.pipeline.stages import stages_of
 from handeye_tri.records import Plan
 
 # What each is for, in a few words.
@@ -39,7 +41,8 @@ def plan_more(run: Run, half_turns: int) -> Plan:
     """
     from handeye_tri.plan import Visited, plan_next
 
-    run.folder.require("detect")
+    stages = stages_of(run)
+    require(run, stages, stages["detect"])
     session = run.observed()
     views = np.asarray(np.isfinite(session.pixels).all(axis=(2, 3)).T)
     seen = np.asarray(views.any(axis=1))
@@ -74,6 +77,17 @@ def plan_more(run: Run, half_turns: int) -> Plan:
         np.array([station.joints for station in plan.stations]),
     )
     return plan
+
+
+def planned_outcome(run: Run) -> str:
+    """The verdict of a session's plan that is whole and up to date.
+
+    Raises:
+        StorageError: there is none, it is damaged, or the cell changed since.
+    """
+    stages = stages_of(run)
+    require(run, stages, stages["plan"])
+    return run.plan().outcome
 
 
 def write_programme(run: Run, layout: str, path: Path, dwell: float) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -32,6 +33,32 @@ TRUTH_SCHEMA = "handeye_tri.truth/1"
 CAMERAS_SCHEMA = "handeye_tri.cameras/1"
 HAND_EYE_SCHEMA = "handeye_tri.hand_eye/1"
 EVALUATION_SCHEMA = "handeye_tri.evaluation/1"
+# Of what each stage writes. A file whose keys change gets a new number here, so that
+# a stage that wrote the old ones counts as stale.
+SCHEMAS = {
+    "plan": PLAN_SCHEMA,
+    "simulate": TRUTH_SCHEMA,
+    "cameras": CAMERAS_SCHEMA,
+    "hand_eye": HAND_EYE_SCHEMA,
+    "evaluate": EVALUATION_SCHEMA,
+}
+# What terminal, report and recording take from evaluation.json.
+_EVALUATION_KEYS = (
+    *("verdict", "sentence", "nearest", "simulated", "gates", "findings", "result"),
+    *("robot.asked", "robot.estimated", "robot.undetermined"),
+    *(
+        f"track.{key}"
+        for key in (
+            *("source", "stations", "mean_mm", "rms_mm", "max_mm", "positions"),
+            *("worst_station", "worst_marker", "predicted_rms_mm"),
+            *("against_prediction", "predicted_parts_mm"),
+        )
+    ),
+    "cross_checks.cross_validation",
+    "cross_checks.bootstrap",
+    "cross_checks.parametric_bootstrap",
+)
+T = TypeVar("T")
 # How the cell is calibrated: everything together, or step by step.
 METHODS = ("joint", "separate")
 # Systematic errors of the robot that a joint calibration can be asked to estimate.
@@ -112,7 +139,7 @@ def start(
     return SessionFolder.prepare(
         out,
         {
-            "schema": "handeye_tri.session/1",
+            "schema": storage.SESSION_SCHEMA,
             "software": software(),
             "cell": cell.model_dump(mode="json", by_alias=True),
             "cell_file": str(path),
@@ -237,30 +264,29 @@ class Run:
 
     def plan(self) -> Plan:
         """The programme, read back."""
-        return storage.decoded(
-            self.folder.file("plan.json"), PLAN_SCHEMA, codec.plan_from_json
-        )
+        return self._decoded("plan", "plan", "plan.json", codec.plan_from_json)
 
     def truth(self) -> tuple[GroundTruth, NDArray[np.float64]] | None:
         """The ground truth and executed joints, where there are any."""
         if not self.folder.header["simulated"]:
             return None
-        return storage.decoded(
-            self.folder.file("truth.json"), TRUTH_SCHEMA, codec.truth_from_json
+        return self._decoded(
+            "simulate", "simulate", "truth.json", codec.truth_from_json
         )
 
     def cameras(self) -> CameraCalibration:
         """The calibrated cameras, read back."""
-        return storage.decoded(
-            self.folder.file("cameras.json"),
-            CAMERAS_SCHEMA,
+        return self._decoded(
+            "cameras",
+            "calibrate",
+            "cameras.json",
             codec.camera_calibration_from_json,
         )
 
     def hand_eye(self) -> HandEyeCalibration:
         """The calibrated cell, read back."""
-        return storage.decoded(
-            self.folder.file("hand_eye.json"), HAND_EYE_SCHEMA, codec.hand_eye_from_json
+        return self._decoded(
+            "hand_eye", "calibrate", "hand_eye.json", codec.hand_eye_from_json
         )
 
     def image_name(self, camera: str, station: int) -> str:
@@ -281,7 +307,24 @@ class Run:
 
     def evaluation(self) -> dict[str, Any]:
         """The evaluation as it stands in evaluation.json."""
-        return storage.read_json(self.folder.file("evaluation.json"), EVALUATION_SCHEMA)
+
+        def complete(data: dict[str, Any]) -> dict[str, Any]:
+            for path in _EVALUATION_KEYS:
+                part: Any = data
+                for key in path.split("."):
+                    part = part[key]
+            return data
+
+        return self._decoded("evaluate", "evaluate", "evaluation.json", complete)
+
+    def _decoded(
+        self, stage: str, verb: str, name: str, decode: Callable[[dict[str, Any]], T]
+    ) -> T:
+        """What a stage, run by a verb, wrote into a file of the session."""
+        remedy = f"run: handeye-tri {verb} {self.folder.path} --again"
+        if verb in ("plan", "simulate") and self.imported_by:
+            remedy = f"import it again into another folder: {self.imported_by}"
+        return storage.decoded(self.folder.file(name), SCHEMAS[stage], decode, remedy)
 
     def written(self) -> list[str]:
         """Files that a person opens, where they are there, first one first."""

@@ -19,7 +19,12 @@ from handeye_tri.storage.files import (
     write_image,
     write_json,
 )
-from handeye_tri.storage.folder import SessionFolder, decoded, fingerprint
+from handeye_tri.storage.folder import (
+    SESSION_SCHEMA,
+    SessionFolder,
+    decoded,
+    fingerprint,
+)
 from handeye_tri.storage.joint_files import read_joint_list, write_joint_list
 from handeye_tri.storage.pose_files import (
     POSES_SCHEMA,
@@ -32,6 +37,7 @@ from handeye_tri.storage.trajectories import tum_text, write_tum
 
 __all__ = [
     "POSES_SCHEMA",
+    "SESSION_SCHEMA",
     "PoseReader",
     "SessionFolder",
     "decode_image",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
 import struct
 import tempfile
@@ -21,6 +22,8 @@ from handeye_tri.errors import StorageError
 # Larger than any calibration image or record of ours; refuses bombs.
 _MAX_BYTES = 256 * 1024 * 1024
 _MAX_PIXELS = 100_000_000
+# What to do about a file of ours that cannot be read.
+AGAIN = "run the stage that wrote it again"
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -94,26 +97,39 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
     write_bytes(path, (text + "\n").encode())
 
 
-def read_json(path: Path, schema: str) -> dict[str, Any]:
+def read_json(path: Path, schema: str, remedy: str = AGAIN) -> dict[str, Any]:
     """Read JSON that states the expected schema.
+
+    Args:
+        path: The file.
+        schema: What it must say it is.
+        remedy: What to do where it does not.
 
     Raises:
         StorageError: missing, not JSON, or of another schema.
     """
     try:
-        data = json.loads(read_bytes(path).decode())
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        data = json.loads(
+            read_bytes(path).decode(), parse_float=_finite, parse_constant=_finite
+        )
+    except (ValueError, RecursionError) as error:
         raise StorageError(
-            f"{path}: this is not readable JSON ({error}); "
-            "run the stage that wrote it again"
+            f"{path}: this is not readable JSON ({error}); {remedy}"
         ) from None
     found = data.get("schema") if isinstance(data, dict) else None
     if found != schema:
         raise StorageError(
-            f"{path}: its schema is {found!r}, this version reads {schema!r}; "
-            "run the stage that wrote it again"
+            f"{path}: its schema is {found!r}, this version of handeye-tri reads "
+            f"{schema!r}; {remedy}"
         )
     return dict(data)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is not a finite number")
+    return value
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -137,14 +153,10 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     except Exception as error:
         # zipfile, zlib and numpy raise a dozen types for a damaged archive.
         raise StorageError(
-            f"{path}: this is not a readable array file ({error}); "
-            "run the stage that wrote it again"
+            f"{path}: this is not a readable array file ({error}); {AGAIN}"
         ) from None
     if absent:
-        raise StorageError(
-            f"{path}: the array {absent[0]!r} is missing; "
-            "run the stage that wrote it again"
-        )
+        raise StorageError(f"{path}: the array {absent[0]!r} is missing; {AGAIN}")
     return arrays
 
 

@@ -13,9 +13,9 @@ from typing import Any, Literal, TypeVar
 
 from handeye_tri.config import CellToCalibrate, parse_any_cell
 from handeye_tri.errors import HandEyeError, StorageError
-from handeye_tri.storage.files import read_json, sha256, write_json
+from handeye_tri.storage.files import AGAIN, read_json, sha256, write_json
 
-SCHEMA = "handeye_tri.session/1"
+SESSION_SCHEMA = "handeye_tri.session/2"
 StageState = Literal["missing", "stale", "damaged", "done"]
 T = TypeVar("T")
 
@@ -56,7 +56,12 @@ class SessionFolder:
                 f"{path}: this folder holds no session.json, so it is no session; "
                 "name a folder that handeye-tri wrote"
             )
-        header = read_json(path / "session.json", SCHEMA)
+        header = read_json(
+            path / "session.json",
+            SESSION_SCHEMA,
+            "run or import the session again into a new folder",
+        )
+        digest = header.pop("sha256", None)
         wrong = [
             key
             for key, kind in (
@@ -73,6 +78,12 @@ class SessionFolder:
             raise StorageError(
                 f"{path / 'session.json'}: {', '.join(wrong)} missing or of the wrong "
                 "kind; run the session again into a new folder"
+            )
+        if digest != fingerprint(header):
+            raise StorageError(
+                f"{path / 'session.json'}: it was changed or damaged since it was "
+                "written; put it back, or run or import the session again into a new "
+                "folder"
             )
         return cls(path, header)
 
@@ -216,17 +227,31 @@ class SessionFolder:
             self.file(name).unlink(missing_ok=True)
 
     def save(self) -> None:
-        """Write session.json."""
-        write_json(self.path / "session.json", self.header)
+        """Write session.json, with the SHA-256 of what it says."""
+        write_json(
+            self.path / "session.json",
+            {**self.header, "sha256": fingerprint(self.header)},
+        )
 
 
-def decoded(path: Path, schema: str, decode: Callable[[dict[str, Any]], T]) -> T:
+def decoded(
+    path: Path,
+    schema: str,
+    decode: Callable[[dict[str, Any]], T],
+    remedy: str = AGAIN,
+) -> T:
     """Read one of our JSON files into its record.
+
+    Args:
+        path: The file.
+        schema: What it must say it is.
+        decode: Makes the record of its content.
+        remedy: What to do where it cannot be read.
 
     Raises:
         StorageError: missing, not ours, or a key or value does not fit.
     """
-    data = read_json(path, schema)
+    data = read_json(path, schema, remedy)
     try:
         return decode(data)
     except StorageError:
@@ -234,5 +259,6 @@ def decoded(path: Path, schema: str, decode: Callable[[dict[str, Any]], T]) -> T
     except (KeyError, TypeError, ValueError, IndexError, HandEyeError) as error:
         what = f"key {error}" if isinstance(error, KeyError) else str(error)
         raise StorageError(
-            f"{path}: {what} is missing or wrong; run the stage that wrote it again"
+            f"{path}: {what} is missing or wrong for {schema}; it is damaged, or of "
+            f"another version of handeye-tri; {remedy}"
         ) from None

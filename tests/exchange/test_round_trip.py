@@ -112,10 +112,8 @@ def test_a_second_import_does_not_replace_the_first(capsys, both):
 def test_an_import_that_was_killed_is_done_again(capsys, both, tmp_path):
     _, back, _ = both
     bag = back.folder.path.parent / "session.mcap"
-    header = json.loads(back.folder.file("session.json").read_text())
-    (tmp_path / "killed").mkdir()
-    header["stages"] = {}
-    (tmp_path / "killed" / "session.json").write_text(json.dumps(header))
+    header = {**back.folder.header, "stages": {}}
+    SessionFolder(tmp_path / "killed", header).save()
     code, out, _ = call(capsys, "import", "bag", bag, "-o", tmp_path / "killed")
     assert code == 0
     assert "18 stations, 36 images" in out
@@ -193,10 +191,8 @@ def test_damage_to_what_was_imported_says_how_to_have_it_again(capsys, both, tmp
     assert code == 2
     assert "left_003.png was changed or damaged" in err
     assert "import it again into another folder" in err
-    header = json.loads((folder / "session.json").read_text())
     for source in (7, {}, {"command": ["x"]}):
-        changed = json.dumps({**header, "source": source})
-        (folder / "session.json").write_text(changed)
+        SessionFolder(folder, {**back.folder.header, "source": source}).save()
         code, _, err = call(capsys, "detect", folder)
         assert code == 2
         assert "source.command is missing or wrong" in err

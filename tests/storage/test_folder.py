@@ -8,7 +8,7 @@ from handeye_tri.errors import StorageError
 from handeye_tri.storage import SessionFolder, decoded, fingerprint, write_json
 
 HEADER = {
-    "schema": "handeye_tri.session/1",
+    "schema": "handeye_tri.session/2",
     "software": {},
     "cell": {},
     "cell_file": "c",
