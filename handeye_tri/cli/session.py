@@ -283,7 +283,10 @@ def replay(
     step: int | None,
     blueprint: str | None,
 ) -> None:
-    """Show a session's recording, first at the worst station that was used."""
+    """Show a session's recording.
+
+    First comes the worst station that was used.
+    """
     if serve and (station, step, blueprint) != (None, None, None):
         raise click.UsageError(
             "--station, --step and --blueprint are chosen in the page with --serve"
