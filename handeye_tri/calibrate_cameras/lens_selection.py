@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from scipy.special import chdtri
 
 from handeye_tri.calibrate_cameras.degeneracy import (
@@ -80,10 +79,7 @@ def lens_advice(
 
 def _fitted(model: HalfTurnModel, start: State) -> Minimum[State, Blocks] | None:
     """Its minimum from a start, None where that is none or not determined."""
-    largest = float(np.abs(model.data.pixels).max() * model.data.whitener.max())
-    end = minimise(
-        model.evaluate, model.retract, start, float(np.finfo(float).eps * largest)
-    )
+    end = minimise(model.evaluate, model.retract, start, model.rounding)
     if end is None or not end.converged:
         return None
     _, condition = invert_information(NormalEquations.of(end.blocks).reduced())

@@ -1,4 +1,4 @@
-"""Which lens coefficients the data determine, and whether their covariance holds."""
+"""Which lens coefficients the data determine."""
 
 from __future__ import annotations
 
@@ -11,10 +11,6 @@ from numpy.typing import NDArray
 from handeye_tri.camera import PinholeCamera, distort_jacobians
 
 Floats = NDArray[np.float64]
-
-# Sigma of the principal point over the radius of what was seen from which on the
-# covariance, linear as it is, is too small along its short axes.
-_CURVED = 1.0 / 25.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,43 +86,3 @@ def judge_lens(
             )
         )
     return tuple(result)
-
-
-def centre_weakness(
-    camera: PinholeCamera, covariance: Floats, names: Sequence[str], points: Floats
-) -> str | None:
-    """Say where the lens bends too much about its centre for a linear covariance.
-
-    Distortion is about the principal point. As that moves, lens and poses follow on a
-    curve, not on a line: each sigma by itself stays about right, but combinations of
-    intrinsics and lens that are stated as well known miss by more than is stated.
-
-    Args:
-        camera: The camera as estimated.
-        covariance: Of the quantities in ``names``, shape (p, p).
-        names: Of the intrinsics and lens coefficients that were estimated.
-        points: The markers that were seen, camera frame, shape (..., 3), metres.
-
-    Returns:
-        A sentence with the numbers and the remedy; None where there is no need.
-    """
-    sigma = {
-        name: float(np.sqrt(covariance[names.index(name), names.index(name)]))
-        for name in ("cx", "cy")
-        if name in names
-    }
-    centre = camera.intrinsics.vector[3:]
-    offset = camera.project(points.reshape(-1, 3)) - centre
-    radius = float(np.linalg.norm(offset, axis=-1).max())
-    if max(sigma.values(), default=0.0) <= _CURVED * radius:
-        return None
-    values = dict(zip(("cx", "cy"), centre, strict=True))
-    listed = ", ".join(
-        f"{name} {values[name]:.1f} +- {of:.2g} px" for name, of in sigma.items()
-    )
-    return (
-        f"{listed}: the lens is centred there and the markers reach {radius:.0f} px "
-        "from it, so that the covariance of intrinsics and lens together is only a "
-        "linear one, and too small; give cx and cy in fixed where they are known, "
-        "average images, or add half-turns"
-    )

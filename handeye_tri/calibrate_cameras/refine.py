@@ -10,7 +10,9 @@ turn_covariance) in the triangle's frame as prior.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +98,12 @@ class HalfTurnModel:
         self._hat_points = hat(data.points)
 
     @property
+    def rounding(self) -> float:
+        """Whitened residuals that are rounding only, root mean square."""
+        largest = np.abs(self.data.pixels).max() * self.data.whitener.max()
+        return float(np.finfo(float).eps * largest)
+
+    @property
     def camera_unknowns(self) -> int:
         """Number of intrinsics and lens coefficients that are estimated."""
         return len(self.choice.names) + len(self.lens)
@@ -126,6 +134,17 @@ class HalfTurnModel:
         result = self.with_lens(())
         result.choice = IntrinsicChoice((), np.zeros((5, 0)), np.zeros(5), None)
         result.shared_o = False
+        return result
+
+    def with_known(self, names: Collection[str]) -> HalfTurnModel:
+        """The same model with these intrinsics as they are in the state."""
+        result = self.with_lens(self.lens)
+        kept = [name not in names for name in self.choice.names]
+        result.choice = replace(
+            self.choice,
+            names=tuple(compress(self.choice.names, kept)),
+            basis=self.choice.basis[:, kept],
+        )
         return result
 
     def with_lens(self, lens: tuple[int, ...]) -> HalfTurnModel:
@@ -289,8 +308,7 @@ def refine_from_starts(
         The minimum, its ``cost_start`` that of the start it came from; which start.
         None where no start has every marker in front of the camera.
     """
-    largest = float(np.abs(model.data.pixels).max())
-    rounding = float(np.finfo(float).eps * largest * model.data.whitener.max())
+    rounding = model.rounding
     pinhole = model.with_lens(())
     best: Minimum[State, Blocks] | None = None
     chosen = 0

@@ -29,7 +29,7 @@ from handeye_tri.calibrate_cameras.intrinsic_choice import (
     split_fixed,
 )
 from handeye_tri.calibrate_cameras.lens_selection import lens_advice
-from handeye_tri.calibrate_cameras.lens_verdict import centre_weakness, judge_lens
+from handeye_tri.calibrate_cameras.lens_verdict import judge_lens
 from handeye_tri.calibrate_cameras.options import (
     lens_choice,
     o_choice,
@@ -110,7 +110,9 @@ def calibrate_camera(
         aspect: fy / fx, where that is known. fy then follows from fx and has no row
             of its own in ``covariance``. With zero skew, a known principal point and
             aspect ratio, one half-turn is enough.
-        distortion: Lens coefficients to estimate: all of a model, or their names.
+        distortion: Lens coefficients to estimate: all of a model, or their names. With
+            the principal point estimated too, camera and covariance are mean and
+            second moments of the likelihood (:mod:`lens_centre`), not its maximum.
         refine: False stops at the closed form.
         method: Closed form by the paper's rows, or by whitened homographies, which
             are about twice as accurate and near the Cramer-Rao bound. With ``refine``
@@ -152,9 +154,7 @@ def calibrate_camera(
         - "lens_verdict": a :class:`LensVerdict` for each lens coefficient estimated:
           its effect in pixels, that of its sigma, and whether it is determined;
         - "weaknesses": sentences on what makes fx or fy uncertain by more than a
-          fiftieth (a small target, low tilt, few half-turns), and the remedy; also
-          where a lens bends so much about its uncertain centre that ``covariance``
-          is too small;
+          fiftieth (a small target, low tilt, few half-turns), and the remedy;
         - "dropped": with ``reject``, why each half-turn was dropped, by index;
         - "used": indices of the half-turns used; "plane_spread_deg"; "start";
           "iterations".
@@ -263,16 +263,13 @@ def calibrate_camera(
     if lens:
         both = np.stack([outcome.state.poses, model.after_poses(outcome.state)], 1)
         seen = triangle.points @ np.swapaxes(both[..., :3, :3], -1, -2)
-        seen = seen + both[..., None, :3, 3]
         inner_count = len(choice.names)
         details["lens_verdict"] = judge_lens(
             camera,
             outcome.covariance[inner_count:, inner_count:],
             names[inner_count:],
-            seen,
+            seen + both[..., None, :3, 3],
         )
-        bent = centre_weakness(camera, outcome.covariance, names, seen)
-        details["weaknesses"] += () if bent is None else (bent,)
     residuals = np.full((1, 2 * n, 3, 2), np.nan)
     missed = data.pixels - model.predict(outcome.state)
     residuals[0, used], residuals[0, n + used] = missed[:, 0], missed[:, 1]

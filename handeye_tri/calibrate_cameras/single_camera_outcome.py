@@ -18,6 +18,7 @@ from handeye_tri.calibrate_cameras.degeneracy import (
 )
 from handeye_tri.calibrate_cameras.homography import Homographies
 from handeye_tri.calibrate_cameras.least_squares import NormalEquations
+from handeye_tri.calibrate_cameras.lens_centre import average_over_centre
 from handeye_tri.calibrate_cameras.refine import (
     HalfTurnModel,
     State,
@@ -114,6 +115,8 @@ def refined(
 ) -> Outcome:
     """Refine by maximum likelihood (Sec. III-E) from several starts.
 
+    With a lens the likelihood is then averaged over its centre.
+
     Args:
         model: Of the half-turns.
         starts: By name.
@@ -137,8 +140,6 @@ def refined(
         check_turns(model.data, np.sqrt((missed**2).mean(axis=(1, 2, 3))))
     equations = NormalEquations.of(end.blocks)
     covariance, condition = invert_information(equations.reduced())
-    count = model.camera_unknowns
-    covariance = covariance[:count, :count]
     noise = end.cost / model.dof
     normals, focal = state.poses[:, :3, 2], state.intrinsics[:2]
     sigma = _focal_sigma(model, covariance, least_noise(noise, noise_known))
@@ -159,10 +160,16 @@ def refined(
         )
     closed = starts.get("closed form")
     closed_cost = None if closed is None else model.evaluate(closed)
+    scale = 1.0 if noise_known else noise
+    covariance, chi2 = covariance * scale, end.cost
+    averaged = average_over_centre(model, end, scale) if model.lens else None
+    if averaged is not None:
+        state, chi2, covariance = averaged.state, averaged.cost, averaged.covariance
+    count = model.camera_unknowns
     return Outcome(
         state,
-        covariance * (1.0 if noise_known else noise),
-        end.cost,
+        covariance[:count, :count],
+        chi2,
         condition,
         end.cost_start if closed_cost is None else closed_cost.cost,
         list(starts)[chosen],

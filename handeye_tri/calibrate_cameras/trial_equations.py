@@ -77,7 +77,7 @@ class Equations:
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             eliminate(own, size)
             shared = self._without_own(own)
-            shared_scale = np.stack([self.shared[k, k] for k in range(g)])
+            shared_scale = np.einsum("kkc->kc", self.shared[:g, :g]).copy()
             for k in range(g):
                 shared[k, k] += damping * shared_scale[k]
             eliminate(shared, g)
@@ -135,3 +135,26 @@ def eliminate(rows: Floats, count: int) -> None:
         rows[k, k:] *= 1.0 / np.sqrt(rows[k, k])
         for i in range(k + 1, count):
             rows[i, i:] -= rows[k, i] * rows[k, i:]
+
+
+def inverses(information: Floats) -> tuple[Floats, Floats]:
+    """Inverses of information matrices (c, g, g), scaled to unit diagonal first.
+
+    Returns:
+        Inverses, NaN where singular; products of the Frobenius norms of scaled matrix
+        and inverse, which bound the condition number from above.
+    """
+    diagonal = np.einsum("cgg->cg", information)
+    sound = np.isfinite(information).all(axis=(1, 2)) & (diagonal > 0).all(axis=1)
+    scale = np.where(sound[:, None], np.sqrt(np.abs(diagonal)), 1.0)
+    scaled = information / (scale[:, :, None] * scale[:, None, :])
+    scaled[~sound] = np.eye(scaled.shape[-1])
+    # An exactly singular matrix would stop the others, too.
+    sound &= np.linalg.slogdet(scaled)[0] > 0
+    scaled[~sound] = np.eye(scaled.shape[-1])
+    inverse = np.linalg.inv(scaled)
+    condition = np.sqrt((scaled**2).sum(axis=(1, 2)) * (inverse**2).sum(axis=(1, 2)))
+    inverse = 0.5 * (inverse + np.swapaxes(inverse, 1, 2))
+    inverse /= scale[:, :, None] * scale[:, None, :]
+    inverse[~sound], condition[~sound] = np.nan, np.inf
+    return inverse, condition

@@ -19,6 +19,8 @@ from handeye_tri.calibrate_cameras.degeneracy import (
 )
 from handeye_tri.calibrate_cameras.half_turns import read_axes
 from handeye_tri.calibrate_cameras.options import lens_choice, o_choice
+from handeye_tri.calibrate_cameras.trial_centre import average_trials_over_centre
+from handeye_tri.calibrate_cameras.trial_equations import inverses
 from handeye_tri.calibrate_cameras.trial_minimise import (
     RELATIVE_TOLERANCE,
     TrialMinima,
@@ -107,7 +109,8 @@ def calibrate_trials(
     2008, doi:10.1109/TIP.2008.2005562, Sec. III), each half-turn's pose eliminated.
     A trial that does not look like a good fit is started a second time from a generic
     camera and the lower cost is kept; without ``sigma_px`` every trial is. A trial
-    that fails is flagged and leaves the others alone.
+    that fails is flagged and leaves the others alone. With a lens the likelihood is
+    averaged over its centre (:mod:`lens_centre`).
 
     Args:
         before: Pixels of A, B, C before each half-turn, shape (t, n, 3, 2). Half-turns
@@ -299,7 +302,7 @@ def _fill(
     scale = 1.0 if sigma_px is None else sigma_px
     chi2 = found.cost / scale**2
     k = result.covariance.shape[1]
-    covariance, condition = _inverses(found.equations.information() / scale**2)
+    covariance, condition = inverses(found.equations.information() / scale**2)
     place = model.places[:k]
     covariance = covariance[:, place][:, :, place]
     noise = np.ones(len(rows))
@@ -319,12 +322,18 @@ def _fill(
         failures[rows[flags]] = why
     good = found.converged & ~weak & ~nothing
     put = rows[good]
-    state = found.state.take(good)
+    state, chi2 = found.state.take(good), chi2[good]
+    covariance = noise[good, None, None] * covariance[good]
+    if model.lens:
+        state, chi2, covariance = average_trials_over_centre(
+            model.take(good), state, chi2 * scale**2, covariance, noise[good] * scale**2
+        )
+        chi2 = chi2 / scale**2
     result.converged[put] = True
     result.intrinsics[put] = state.intrinsics.T
     result.lens[put] = state.lens.T
-    result.covariance[put] = noise[good, None, None] * covariance[good]
-    result.chi2[put] = chi2[good]
+    result.covariance[put] = covariance
+    result.chi2[put] = chi2
     result.cost_start[put] = found.cost_start[good] / scale**2
     result.iterations[put] = found.iterations[good]
     poses = np.zeros((len(put), model.weight.shape[0], 4, 4))
@@ -336,26 +345,3 @@ def _fill(
     o = np.broadcast_to(state.o, (2, *model.weight[:, good].shape))
     seen = (model.weight[:, good] > 0) & about[:, None]
     result.o[put] = np.where(seen, o, np.nan).transpose(2, 1, 0)
-
-
-def _inverses(information: Floats) -> tuple[Floats, Floats]:
-    """Inverses of information matrices (c, g, g), scaled to unit diagonal first.
-
-    Returns:
-        Inverses, NaN where singular; products of the Frobenius norms of scaled matrix
-        and inverse, which bound the condition number from above.
-    """
-    diagonal = np.einsum("cgg->cg", information)
-    sound = np.isfinite(information).all(axis=(1, 2)) & (diagonal > 0).all(axis=1)
-    scale = np.where(sound[:, None], np.sqrt(np.abs(diagonal)), 1.0)
-    scaled = information / (scale[:, :, None] * scale[:, None, :])
-    scaled[~sound] = np.eye(scaled.shape[-1])
-    # An exactly singular matrix would stop the others, too.
-    sound &= np.linalg.slogdet(scaled)[0] > 0
-    scaled[~sound] = np.eye(scaled.shape[-1])
-    inverse = np.linalg.inv(scaled)
-    condition = np.sqrt((scaled**2).sum(axis=(1, 2)) * (inverse**2).sum(axis=(1, 2)))
-    inverse = 0.5 * (inverse + np.swapaxes(inverse, 1, 2))
-    inverse /= scale[:, :, None] * scale[:, None, :]
-    inverse[~sound], condition[~sound] = np.nan, np.inf
-    return inverse, condition

@@ -65,7 +65,7 @@ def test_each_trial_is_the_single_calibration(axes: Any, options: Any) -> None:
         names = ["fx", "fy", "skew", "cx", "cy", *one.camera.lens.names]
         mine = mine[[names.index(name) for name in found.labels]]
         assert np.abs((mine - values) / found.sigma[i]).max() < 1e-3
-        assert found.chi2[i] == pytest.approx(one.chi2, rel=1e-9)
+        assert found.chi2[i] == pytest.approx(one.chi2, rel=1e-5 if lens else 1e-9)
         assert found.dof[i] == one.dof
         sigma = [one.covariance.std(f"camera.{name}") for name in found.labels]
         np.testing.assert_allclose(found.sigma[i], sigma, rtol=1e-3)
