@@ -113,12 +113,13 @@ def plan(
     """Plan the robot's stations, and say what they promise.
 
     Before it moves: reachable, visible, free of collision, and chosen for the least
-    track error.
+    track error. plan.rrd shows the arm on its way, and what the cameras will see.
     """
     import json
 
     from handeye_tri import storage
     from handeye_tri.pipeline import PLAN_SCHEMA, start
+    from handeye_tri.pipeline.preview import write_plan_recording
     from handeye_tri.summary import plan_text
 
     if certify is not None and cell is None:
@@ -137,6 +138,9 @@ def plan(
         click.echo(json.dumps(data, indent=1, ensure_ascii=False))
     else:
         click.echo(plan_text(made, finished.cell.name))
+    if finished.is_designed and finished.has_robot:
+        path = write_plan_recording(finished)
+        click.echo(f"wrote {path}: handeye-tri replay {session} --plan", err=True)
     sys.exit(EXIT_CODES[made.outcome])
 
 
@@ -262,6 +266,7 @@ def check(session: Path, as_json: bool) -> None:
 
 @commands.command(epilog=example("handeye-tri replay out --screenshot out.png"))
 @SESSION
+@click.option("--plan", is_flag=True, help="Show the plan instead: the arm moving.")
 @click.option("--serve", is_flag=True, help="Serve it to a browser, on loopback only.")
 @click.option(
     "--screenshot",
@@ -277,6 +282,7 @@ def check(session: Path, as_json: bool) -> None:
 )
 def replay(
     session: Path,
+    plan: bool,
     serve: bool,
     screenshot: Path | None,
     station: int | None,
@@ -292,11 +298,19 @@ def replay(
             "--station, --step and --blueprint are chosen in the page with --serve"
         )
     from handeye_tri import replay as recording
+    from handeye_tri.errors import StorageError
     from handeye_tri.storage import SessionFolder
 
     folder = SessionFolder.open(session)
-    folder.require("report")
-    path = folder.file("replay.rrd")
+    if plan:
+        path = folder.file("plan.rrd")
+        if not path.is_file():
+            raise StorageError(
+                f"{path}: this file is missing; run: handeye-tri plan {session}"
+            )
+    else:
+        folder.require("report")
+        path = folder.file("replay.rrd")
     if screenshot is not None:
         problems = recording.screenshot(
             path,

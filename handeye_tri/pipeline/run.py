@@ -176,6 +176,13 @@ class Run:
         return self.folder.cell
 
     @property
+    def is_designed(self) -> bool:
+        """Whether the cell is described whole, not only as measured."""
+        from handeye_tri.config import Cell
+
+        return isinstance(self.cell, Cell)
+
+    @property
     def designed_cell(self) -> Cell:
         """The whole description.
 

@@ -20,7 +20,7 @@ from handeye_tri.se3 import SE3, se3_inverse
 Floats = NDArray[np.float64]
 
 # How far before a camera its image is drawn, metres, and the truth's outline.
-_IMAGE_DISTANCE, _TRUTH_DISTANCE = 0.25, 0.29
+IMAGE_DISTANCE, _TRUTH_DISTANCE = 0.25, 0.29
 # Labels stand this far above what they name, metres.
 _ABOVE = np.array([0.0, 0.0, 0.15])
 
@@ -57,12 +57,12 @@ def log_cameras(
     """Frusta and ellipsoids; where the estimated ones stand is logged by step."""
     for camera in calibration.cameras:
         path = camera_path(camera.name)
-        _log_pinhole(recording, path, camera, ESTIMATE, _IMAGE_DISTANCE, 0.002)
+        log_pinhole(recording, path, camera, ESTIMATE, IMAGE_DISTANCE, 0.002)
     if truth is not None:
         for camera, motion in zip(truth.cameras, truth.base_from_camera, strict=True):
             path = f"cell/base/truth/{camera.name}"
             recording.log(path, transform(motion.matrix), static=True)
-            _log_pinhole(recording, path, camera, TRUTH, _TRUTH_DISTANCE, 0.001)
+            log_pinhole(recording, path, camera, TRUTH, _TRUTH_DISTANCE, 0.001)
     for camera, motion, ellipsoid in zip(
         calibration.cameras,
         calibration.base_from_camera,
@@ -92,7 +92,7 @@ def log_cameras(
             )
 
 
-def _log_pinhole(
+def log_pinhole(
     recording: rr.RecordingStream,
     path: str,
     camera: PinholeCamera,
@@ -100,6 +100,7 @@ def _log_pinhole(
     distance: float,
     width: float,
 ) -> None:
+    """A camera's frustum, under which its image is drawn, at all times."""
     to_corner = np.array([[0.0, 0.0, CORNER], [0.0, 0.0, CORNER], [0.0, 0.0, 0.0]])
     recording.log(
         path,

@@ -27,19 +27,19 @@ def layout(
     }
     near = f"95 % ellipsoids x {story.magnification_ellipsoid}"
     gaps = f"gaps x {story.magnification}"
-    whole = _space(
+    whole = space(
         "cell",
         f"Cell: arrows from robot to cameras, {gaps}; {near}",
-        eye_on_cell(calibration, story, base_from_world),
+        eye_on_cell(calibration.base_from_camera, story.reported, base_from_world),
         overrides=frusta,
     )
-    cameras = _space(
+    cameras = space(
         "cell",
         f"Where the cameras are: {near}",
         eye_on_cameras(calibration, base_from_world),
         overrides=frusta,
     )
-    track = _space(
+    track = space(
         "track",
         f"Held-out track, robot and cameras: {gaps}; numbers are true mm",
         eye_on_track(calibration, story),
@@ -78,7 +78,8 @@ def layout(
     )
 
 
-def _space(origin: str, name: str, eye: Eye, **more: Any) -> rrb.Spatial3DView:
+def space(origin: str, name: str, eye: Eye, **more: Any) -> rrb.Spatial3DView:
+    """A view in space, dark, without a grid."""
     return rrb.Spatial3DView(
         origin=origin,
         name=name,

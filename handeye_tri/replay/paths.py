@@ -4,6 +4,8 @@ from __future__ import annotations
 
 # A station of the session; how the calibration got there; a station of the track.
 STATION, STEP, TRACK = "station", "step", "track"
+# Seconds since a planned programme starts.
+TIME = "time"
 NUMBERS = "numbers/track"
 
 

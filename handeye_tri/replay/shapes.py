@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,14 +71,18 @@ def vertex_normals(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
 
 
 def eye_on_cell(
-    calibration: HandEyeCalibration, story: Story, base_from_world: SE3
+    base_from_camera: Sequence[SE3], markers: Floats, base_from_world: SE3
 ) -> Eye:
-    """Robot and cameras in view, in the world: over the cameras' shoulder."""
+    """Robot and cameras in view, in the world: over the cameras' shoulder.
+
+    Args:
+        base_from_camera: Where the cameras are.
+        markers: Where they were, in the base, shape (n, 3, 3), metres.
+        base_from_world: Where the world is.
+    """
     world_from_base = base_from_world.inverse()
-    centres = world_from_base.apply(
-        [motion.translation for motion in calibration.base_from_camera]
-    )
-    rig = world_from_base.apply(story.reported.mean(axis=(0, 1)))
+    centres = world_from_base.apply([motion.translation for motion in base_from_camera])
+    rig = world_from_base.apply(markers.mean(axis=(0, 1)))
     points = np.vstack([centres, rig, world_from_base.translation])
     target = 0.5 * (points.min(axis=0) + points.max(axis=0))
     target[2] = 0.75 * rig[2] + 0.25 * world_from_base.translation[2]

@@ -74,7 +74,7 @@ def screenshot(
     place = _place(recording, station, step, blueprint)
     options = ["--headless", "--window-size", f"{size[0]}x{size[1]}"]
     with _viewer(options) as (process, client):
-        _open_at(process, client, recording, *place)
+        _open_at(process, client, recording, *place, still=True)
         drawn = _when_still(client)
         views = client.get_state().views
     write_bytes(picture, drawn)
@@ -106,7 +106,7 @@ def open_viewer(
     """
     place = _place(recording, station, step, blueprint)
     with _viewer([]) as (process, client):
-        _open_at(process, client, recording, *place)
+        _open_at(process, client, recording, *place, still=False)
         process.wait()
 
 
@@ -149,8 +149,11 @@ def _to_stderr(line: str) -> None:
 
 def _place(
     recording: Path, station: int | None, step: int | None, blueprint: str
-) -> tuple[str, int, str]:
-    """Timeline, where on it, and tab; reads the file before anything is started."""
+) -> tuple[str, int | None, str]:
+    """Timeline, where on it, and tab; reads the file before anything is started.
+
+    A recording that plays by itself shows no station first: None.
+    """
     numbers = read_numbers(recording)
     if blueprint not in BLUEPRINTS:
         raise InputError(
@@ -163,7 +166,8 @@ def _place(
     if step is not None:
         timeline, at, count = STEP, step, int(numbers["step_count"])
     if at is None:
-        at = int(numbers["shown_station"])
+        shown = numbers["shown_station"]
+        return timeline, None if shown is None else int(shown), blueprint
     if not 0 <= at < count:
         raise InputError(
             f"{timeline} {at} is not in {recording}: it has 0 to {count - 1}"
@@ -261,10 +265,15 @@ def _open_at(
     client: Any,
     recording: Path,
     timeline: str,
-    at: int,
+    at: int | None,
     blueprint: str,
+    *,
+    still: bool,
 ) -> None:
-    """Open a recording, wait until it is loaded, and go to a place and a tab."""
+    """Open a recording, wait until it is loaded, and go to a place and a tab.
+
+    Where no place is asked for it plays, or stands at its first station.
+    """
     client.open(str(recording.resolve()))
     until = time.monotonic() + _LOAD_S
     while client.get_state().loading:
@@ -273,7 +282,8 @@ def _open_at(
         time.sleep(0.1)
     if blueprint != BLUEPRINTS[0]:
         open_tab(client, BLUEPRINTS.index(blueprint))
-    client.set_time(timeline, sequence=at, play_state="paused")
+    if at is not None or still:
+        client.set_time(timeline, sequence=at or 0, play_state="paused")
 
 
 def _when_still(client: Any) -> bytes:

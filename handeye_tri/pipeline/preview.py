@@ -1,0 +1,106 @@
+"""A session's plan as a recording: ``plan.rrd``."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.pipeline.run import Run
+from handeye_tri.records import Plan
+from handeye_tri.summary import plan_text
+
+Floats = NDArray[np.float64]
+
+PREVIEW = "plan.rrd"
+# Moments of the moving arm are this far apart, and it stands so long at a station.
+_STEP_S, _STAND_S = 0.08, 1.0
+
+
+def write_plan_recording(run: Run) -> Path:
+    """Write what a planned session's robot will do and its cameras will see.
+
+    Raises:
+        StorageError: there is no plan, or the file cannot be written.
+    """
+    from handeye_tri import replay
+
+    plan, arm, cell = run.plan(), run.arm, run.designed_cell
+    times, joints, station = driven(
+        plan, arm.home, arm.speed, cell.arm.acceleration_time_s
+    )
+    path = run.folder.file(PREVIEW)
+    replay.write_preview(
+        path,
+        name=f"{cell.name}, plan",
+        mechanism=run.mechanism,
+        base_from_world=arm.base_from_world,
+        motion=replay.PlannedMotion(
+            plan,
+            times,
+            station,
+            arm.body_poses(joints),
+            arm.marker_positions(joints),
+            tuple(camera.camera for camera in cell.cameras),
+            tuple(arm.base_from_world @ c.world_from_camera for c in cell.cameras),
+            np.array(cell.rig.marker_colours),
+        ),
+        certificate=plan_text(plan, cell.name),
+    )
+    return path
+
+
+def driven(
+    plan: Plan, home: Floats, speed: Floats, acceleration_time: float
+) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """A programme in time: straight moves from rest to rest, a stop per station.
+
+    The slowest joint of a move speeds up evenly, travels at its speed limit if it
+    gets there, and slows down evenly; the others keep in step.
+
+    Args:
+        plan: The programme.
+        home: Where the arm starts, shape (q,), rad or m.
+        speed: Of the joints, shape (q,), rad/s or m/s.
+        acceleration_time: From rest to full speed, seconds.
+
+    Returns:
+        Seconds (t,), joints (t, q), and the station stood at, -1 on the way (t,).
+    """
+    now, times, joints, station = 0.0, [0.0], [home], [-1]
+    here = home
+    for index, (stop, via) in enumerate(zip(plan.stations, plan.via, strict=True)):
+        for start, end in pairwise([here, *via, stop.joints]):
+            moments, shares = _move(float((np.abs(end - start) / speed).max()),
+                                    acceleration_time)  # fmt: skip
+            times += (now + moments).tolist()
+            joints += [start + share * (end - start) for share in shares]
+            station += [-1] * len(moments)
+            now = times[-1]
+        # Arrival and departure.
+        times += [now + _STEP_S, now + _STAND_S]
+        joints += [stop.joints] * 2
+        station += [index] * 2
+        now, here = times[-1], stop.joints
+    return np.array(times), np.array(joints), np.array(station, dtype=np.intp)
+
+
+def _move(cruise: float, acceleration_time: float) -> tuple[Floats, Floats]:
+    """Moments (k,) of a move and the share of it that is done by then (k,).
+
+    Args:
+        cruise: Seconds that the slowest joint would take at full speed.
+        acceleration_time: Seconds from rest to full speed.
+    """
+    rise = min(acceleration_time, float(np.sqrt(cruise * acceleration_time)))
+    if rise == 0.0:
+        return np.zeros(0), np.zeros(0)
+    total = cruise * acceleration_time / rise + rise
+    steps = max(int(np.ceil(total / _STEP_S)), 1)
+    moments = total * np.arange(1, steps + 1) / steps
+    early, late = np.minimum(moments, rise), np.minimum(total - moments, rise)
+    way = np.where(moments < rise, 0.5 * early**2, rise * (moments - 0.5 * rise))
+    way = np.where(total - moments < rise, rise * (total - rise) - 0.5 * late**2, way)
+    return moments, way / (rise * (total - rise))
