@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from handeye_tri.kinematics import InverseSolutions, SerialChain
+from handeye_tri.kinematics import InverseKinematics, InverseSolutions, SerialChain
 from handeye_tri.mechanism import Geometry, Mechanism
 from handeye_tri.se3 import SE3
 from handeye_tri.solids import (
@@ -91,6 +91,7 @@ class Arm:
             self.lower,
             self.upper,
         )
+        self._inverse = InverseKinematics(self._chain)
         self._solids = self._build_solids()
         self._solid_data = self._solids.createData()
         self._place_solids(self.home)
@@ -201,10 +202,10 @@ class Arm:
         starts: int = 48,
         first: bool = False,
     ) -> InverseSolutions:
-        """Joints that reach flange poses, (n, 4, 4); see SerialChain.inverse."""
+        """Joints that reach flange poses, (n, 4, 4); see InverseKinematics."""
         targets = np.asarray(base_from_flange, dtype=float).reshape(-1, 4, 4)
         world = self.base_from_world.inverse().matrix @ targets
-        return self._chain.inverse(world, rng, starts=starts, first=first)
+        return self._inverse.solve(world, rng, starts=starts, first=first)
 
     def perturbed(self, q: ArrayLike, tangent: ArrayLike) -> Floats:
         """Joints with ``forward(result) == forward(q) @ exp(tangent)``.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from handeye_tri.errors import ConvergenceError, InputError
-from handeye_tri.kinematics import SerialChain
+from handeye_tri.kinematics import InverseKinematics, SerialChain
 from handeye_tri.se3 import se3_exp, se3_inverse, se3_log, so3_exp
 
 
@@ -42,6 +42,20 @@ def seven_joints():
     return SerialChain(np.array(placements), np.zeros(7, bool), FLANGE, -limit, limit)
 
 
+def three_parallel_axes():
+    """Lengths of a UR5e: no wrist whose axes meet."""
+    placements = [
+        placement(0, 0, 0.1625),
+        placement(0, 0, 0, QUARTER),
+        placement(-0.425, 0, 0),
+        placement(-0.3922, 0, 0.1333),
+        placement(0, -0.0997, 0, QUARTER),
+        placement(0, 0.0996, 0, -QUARTER),
+    ]
+    limit = np.array([2, 2, 1, 2, 2, 2]) * np.pi
+    return SerialChain(np.array(placements), np.zeros(6, bool), FLANGE, -limit, limit)
+
+
 def on_a_rail():
     """Six joints on a rail along x: the first joint slides."""
     arm = six_joints()
@@ -56,7 +70,12 @@ def on_a_rail():
     )
 
 
-CHAINS = {"six": six_joints, "seven": seven_joints, "rail": on_a_rail}
+CHAINS = {
+    "six": six_joints,
+    "parallel": three_parallel_axes,
+    "seven": seven_joints,
+    "rail": on_a_rail,
+}
 
 
 @pytest.fixture(params=CHAINS)
@@ -107,7 +126,7 @@ def test_jacobian_meets_central_differences(chain, rng):
 def test_inverse_reaches_reachable_targets(name, rng):
     chain = CHAINS[name]()
     target = chain.forward(chain.random(rng, 1000))
-    solutions = chain.inverse(target, rng, first=True)
+    solutions = InverseKinematics(chain).solve(target, rng, first=True)
     found = np.array([len(q) > 0 for q in solutions.joints])
     assert found.mean() >= 0.995
     joints = np.array([q[0] for q in solutions.joints if len(q)])
@@ -120,7 +139,9 @@ def test_inverse_finds_all_branches_of_a_spherical_wrist(rng):
     """Elbow and wrist give four solutions here; the drawn one is among them."""
     chain = six_joints()
     drawn = np.radians([[20, 10, -20, 40, 60, 30]])
-    solutions = chain.inverse(chain.forward(drawn), rng, starts=80).joints[0]
+    solutions = (
+        InverseKinematics(chain).solve(chain.forward(drawn), rng, starts=80).joints[0]
+    )
     assert np.abs(solutions - drawn).max(axis=1).min() < 1e-8
     # Turning the wrist over: r + 180, -b, t + 180 is the same pose.
     flipped = np.radians([20, 10, -20, -140, -60, -150])
@@ -138,15 +159,15 @@ def test_inverse_tells_out_of_reach_from_beyond_the_limits(rng):
     q = np.radians([[90.0, 10, -20, 40, 60, 30]])
     behind.lower, behind.upper = behind.lower.copy(), behind.upper.copy()
     behind.lower[0], behind.upper[0] = -0.1, 0.1
-    assert len(chain.inverse(far, rng).joints[0]) == 0
-    assert not chain.inverse(far, rng).beyond_limits[0]
-    limited = behind.inverse(chain.forward(q), rng)
+    assert len(InverseKinematics(chain).solve(far, rng).joints[0]) == 0
+    assert not InverseKinematics(chain).solve(far, rng).beyond_limits[0]
+    limited = InverseKinematics(behind).solve(chain.forward(q), rng)
     assert len(limited.joints[0]) == 0
     assert limited.beyond_limits[0]
 
 
 def test_inverse_of_nothing_is_nothing(rng):
-    solutions = six_joints().inverse(np.zeros((0, 4, 4)), rng)
+    solutions = InverseKinematics(six_joints()).solve(np.zeros((0, 4, 4)), rng)
     assert solutions.joints == ()
     assert solutions.beyond_limits.shape == (0,)
 
@@ -155,7 +176,8 @@ def test_inverse_repeats_by_seed():
     chain = six_joints()
     target = chain.forward(chain.random(np.random.default_rng(3), 20))
     first, second = (
-        chain.inverse(target, np.random.default_rng(4)).joints for _ in range(2)
+        InverseKinematics(chain).solve(target, np.random.default_rng(4)).joints
+        for _ in range(2)
     )
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a, b)
