@@ -27,7 +27,7 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 DEFAULT_THREADS = {k: v for k, v in os.environ.items() if k not in THREAD_VARIABLES}
 # Numpy is imported with the modules of rows, and reads these then.
 os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-MODULES = ("bench_cameras", "bench_adjust", "bench_hand_eye")
+MODULES = ("bench_cameras", "bench_adjust", "bench_hand_eye", "bench_kinematics")
 THREADS_ROW, THREADS_BAR = 11, 1.1
 # The least time that one measurement of one side spends, repeating short calls.
 LEAST_SECONDS = 0.3
