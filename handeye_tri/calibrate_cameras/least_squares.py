@@ -202,6 +202,7 @@ def minimise(
     tolerance: float = RELATIVE_TOLERANCE,
     damping: float = _START_DAMPING,
     foresee: bool = False,
+    take_last: bool = True,
 ) -> Minimum[State, Rows] | None:
     """Levenberg-Marquardt with Nielsen's damping rule (IMM-REP-1999-05).
 
@@ -217,6 +218,7 @@ def minimise(
         damping: Of the first step.
         foresee: Apply ``tolerance`` to the step after the last one, which gains less
             by at least the factor by which the last gains less than the one before.
+        take_last: Whether to take the last step, too, and not just to know it.
 
     Returns:
         The minimum; None where the start cannot be evaluated.
@@ -233,6 +235,7 @@ def minimise(
             tolerance,
             damping,
             foresee,
+            take_last,
         )
 
 
@@ -258,6 +261,7 @@ def _minimise(
     tolerance: float,
     damping: float,
     foresee: bool,
+    take_last: bool,
 ) -> Minimum[State, Rows] | None:
     blocks = evaluate(start)
     if blocks is None:
@@ -282,6 +286,9 @@ def _minimise(
         if foresee and 0.0 < gain < before and damping < _START_DAMPING:
             last = gain * (gain / before)
         negligible = last <= max(tolerance * cost / freedom, floor)
+        if negligible and damping < 1.0 and not take_last:
+            converged = True
+            break
         if (
             known is not None
             and gain < 0.1 * known

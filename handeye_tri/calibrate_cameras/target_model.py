@@ -277,6 +277,7 @@ class TargetModel:
         # (0, w, -yw, -qz - y qy, y qx, qx) with q over the depth.
         by_pose = self.scratch.array("by pose", (2, 6, m, n, p))
         near = self.scratch.array("near", (3, m, n, p))
+        moved = self.scratch.array("moved", (4, m, n, p))
         np.negative(w, out=near[0])
         np.multiply(q[1], near[0], out=near[1])
         np.multiply(q[0], w, out=near[2])
@@ -285,8 +286,6 @@ class TargetModel:
         y = translation[..., 1:2] * w - near[1]
         np.multiply(x, near, out=by_pose[0, 2:5])
         np.multiply(y, near, out=by_pose[1, 2:5])
-        by_pose[0, 0] = by_pose[1, 1] = w
-        by_pose[0, 1] = by_pose[1, 0] = 0.0
         by_pose[0, 4] += qz
         by_pose[1, 3] -= qz
         by_pose[0, 5], by_pose[1, 5] = near[1], near[2]
@@ -299,10 +298,13 @@ class TargetModel:
             if bent_axes:
                 along_x += skew * bent.x_by_y
                 along_y += skew * bent.y_by_y
-            np.multiply(along_x, by_pose[0], out=u[:6])
-            u[:6] += along_y * by_pose[1]
-            np.multiply(fy * bent.x_by_y, by_pose[0], out=v[:6])
-            v[:6] += (fy * bent.y_by_y) * by_pose[1]
+            down_x, down_y = fy * bent.x_by_y, fy * bent.y_by_y
+            # A shift of x leaves y, and one of y leaves x.
+            for rows, by_x, by_y in ((u, along_x, along_y), (v, down_x, down_y)):
+                np.multiply(by_x, w, out=rows[0])
+                np.multiply(by_y, w, out=rows[1])
+                np.multiply(by_x, by_pose[0, 2:], out=rows[2:6])
+                rows[2:6] += np.multiply(by_y, by_pose[1, 2:], out=moved)
             whole = self.lens == tuple(range(len(lens)))
             by_lens = bent.by_lens if whole else bent.by_lens[:, list(self.lens)]
             np.multiply(fx, by_lens[0], out=u[start:-1])
@@ -310,6 +312,8 @@ class TargetModel:
                 u[start:-1] += skew * by_lens[1]
             np.multiply(fy, by_lens[1], out=v[6 : 6 + len(self.lens)])
         else:
+            by_pose[0, 0] = by_pose[1, 1] = w
+            by_pose[0, 1] = by_pose[1, 0] = 0.0
             np.multiply(fx, by_pose[0], out=u[:6])
             if bent_axes:
                 u[:6] += skew * by_pose[1]

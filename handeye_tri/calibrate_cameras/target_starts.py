@@ -54,7 +54,13 @@ def start_of(
     part = model.take(list(range(m)), few)
     state = closed_forms(part, image_sizes, names)
     end = minimise(
-        part.evaluate, part.retract, state, 0.0, tolerance=_ROUGH, damping=DAMPING
+        part.evaluate,
+        part.retract,
+        state,
+        0.0,
+        tolerance=_ROUGH,
+        damping=DAMPING,
+        take_last=False,
     )
     if end is not None:
         state = end.state

@@ -6,6 +6,7 @@ Every number of a trial is in the last axis of contiguous arrays.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import prod
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ class Scratch:
 
     def array(self, name: str, shape: tuple[int, ...]) -> Floats:
         """An array with any content, valid until the next one of this name."""
-        size = int(np.prod(shape))
+        size = prod(shape)
         if name not in self._buffers or self._buffers[name].size < size:
             self._buffers[name] = np.empty(size)
         return self._buffers[name][:size].reshape(shape)

@@ -16,6 +16,7 @@ Floats = NDArray[np.float64]
 # Below this angle (t - sin t) / t^3 and the like lose digits to cancellation; the
 # first terms left out of their series there are 2e-15 of the result.
 _SMALL_ANGLE = 0.1
+_EYE = np.eye(3)
 
 
 def hat(vector: ArrayLike) -> Floats:
@@ -38,13 +39,19 @@ def hat(vector: ArrayLike) -> Floats:
     return matrix
 
 
+def _first_coefficients(angle: Floats) -> tuple[Floats, Floats]:
+    """Return sin(t)/t and (1-cos t)/t^2 of angles t >= 0, shape (...)."""
+    # As good as nothing, and 1 and 1/2 come out exactly.
+    safe = np.maximum(angle, 1e-150)
+    half = np.sin(0.5 * safe) / safe
+    # (1 - cos t) / t^2 without its cancellation.
+    return np.sin(safe) / safe, 2.0 * half * half
+
+
 def angle_coefficients(angle: Floats) -> tuple[Floats, Floats, Floats]:
     """Return sin(t)/t, (1-cos t)/t^2, (t-sin t)/t^3 of angles t >= 0, shape (...)."""
+    first, second = _first_coefficients(angle)
     square = angle * angle
-    safe = np.where(angle == 0, 1.0, angle)
-    first = np.where(angle == 0, 1.0, np.sin(safe) / safe)
-    # (1 - cos t) / t^2 without its cancellation.
-    second = np.where(angle == 0, 0.5, 2.0 * (np.sin(0.5 * safe) / safe) ** 2)
     small = angle < _SMALL_ANGLE
     safe = np.where(small, 1.0, angle)
     third = np.where(
@@ -65,13 +72,11 @@ def so3_exp(rotation_vector: ArrayLike) -> Floats:
         Shape (..., 3, 3).
     """
     w = np.asarray(rotation_vector, dtype=float)
-    sine, cosine, _ = angle_coefficients(np.linalg.norm(w, axis=-1))
+    sine, cosine = _first_coefficients(np.sqrt((w * w).sum(axis=-1)))
     skew = hat(w)
-    result: Floats = (
-        np.eye(3)
-        + sine[..., None, None] * skew
-        + cosine[..., None, None] * (skew @ skew)
-    )
+    result: Floats = cosine[..., None, None] * (skew @ skew)
+    result += sine[..., None, None] * skew
+    result += _EYE
     return result
 
 
