@@ -242,6 +242,9 @@ def table(folders: list[Path], tracks: list[str] | None) -> bool:
                 if failed
                 else (row["X_rot_err_deg"], row["X_trans_err_mm"])
             )
+    if not errors:
+        print(f"no result of the tracks {', '.join(tracks or [])}; see --tracks")
+        return False
     print(f"{'track':<12}{'n':>4}  {'ours':>21}   best of the others (rotation; place)")
     good, shares = True, []
     for track, solvers in sorted(errors.items()):
