@@ -7,12 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handeye_tri.errors import InputError
 from handeye_tri.records import Floats
 from handeye_tri.se3 import se3_inverse, so3_log
 
 _MAX_PAIRS = 1000
+# Farther apart than this no two stations are taken for a half-turn.
+_MOST_APART = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,11 +41,12 @@ class Turn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundTurns:
-    """What was found among successive stations.
+    """What was found among the stations.
 
     Attributes:
-        turns: The half-turns, each station in one of them at most.
-        others: Turns by 180 degrees that are none of the rig: why, in words.
+        turns: The half-turns by their first stations, each station in one at most.
+        others: Turns by 180 degrees between successive stations that are none of the
+            rig: why, in words.
         axis: Their common axis in the flange's frame, shape (3,).
         foot: Point of the common axis next to the flange's origin, (3,), metres.
     """
@@ -81,11 +85,14 @@ def turn_between(base_from_flange: Floats, before: int, after: int) -> Turn:
 
 
 def find_half_turns(base_from_flange: Floats, tolerance: TurnTolerance) -> FoundTurns:
-    """Pair successive stations that a half-turn of the rig joins.
+    """Pair the stations that a half-turn of the rig joins.
 
     The rig is rigid on the flange, so that all its half-turns have one axis there, and
     nothing moves along it. The axis that most turns by 180 degrees share is taken for
-    the rig's; which of the triangle's axes it is, the poses cannot tell.
+    the rig's; which of the triangle's axes it is, the poses cannot tell. The two
+    stations may be up to 100 apart, as in a programme that is ordered for speed; by
+    chance one pair in a hundred turns by 180 degrees to within a degree, so that such
+    a turn alone counts for none.
 
     Args:
         base_from_flange: Reported poses, shape (n, 4, 4), metres.
@@ -93,40 +100,81 @@ def find_half_turns(base_from_flange: Floats, tolerance: TurnTolerance) -> Found
     """
     candidates = [
         turn
-        for j in range(len(base_from_flange) - 1)
-        if abs((turn := turn_between(base_from_flange, j, j + 1)).miss)
+        for before, after in _nearly_opposite(base_from_flange, tolerance.angle)
+        if abs((turn := turn_between(base_from_flange, before, after)).miss)
         <= tolerance.angle
     ]
+    support = _support(candidates, tolerance)
+    # Stations that follow each other first: a leader that nothing else agrees with
+    # is one of them, or there is none.
+    least = [1 if turn.after == turn.before + 1 else 2 for turn in candidates]
     empty = np.zeros(3)
-    if not candidates:
-        return FoundTurns((), (), empty, empty)
-    agree = [
-        [_difference(one, other, tolerance) == "" for other in candidates]
-        for one in candidates
-    ]
-    # What does not even agree with itself moved along its axis.
-    support = np.sum(agree, axis=1) * np.diagonal(agree)
-    leader = candidates[int(np.argmax(support))]
+    if not (support >= least).any():
+        return FoundTurns((), _others(candidates, None, (), tolerance), empty, empty)
+    leader = candidates[int(np.argmax(np.where(support >= least, support, 0)))]
+    used = set[int]()
     turns: list[Turn] = []
-    others = []
     for turn in candidates:
-        name = f"{turn.before}-{turn.after}"
-        why = _difference(leader, turn, tolerance)
-        if why:
-            others.append(f"{name}: {why}")
-        elif turns and turns[-1].after == turn.before:
-            last = f"{turns[-1].before}-{turns[-1].after}"
-            others.append(f"{name}: station {turn.before} already belongs to {last}")
-        else:
+        stations = {turn.before, turn.after}
+        if not used & stations and not _difference(leader, turn, tolerance):
             turns.append(turn)
-    if not turns:
-        return FoundTurns((), tuple(others), empty, empty)
+            used |= stations
+    turns.sort(key=lambda turn: turn.before)
     signs = [1.0 if turn.axis @ leader.axis > 0 else -1.0 for turn in turns]
     axis = np.mean([s * t.axis for s, t in zip(signs, turns, strict=True)], axis=0)
     foot = np.mean([turn.foot for turn in turns], axis=0)
+    others = _others(candidates, leader, turns, tolerance)
     return FoundTurns(
-        tuple(turns), tuple(others), axis / np.linalg.norm(axis), np.asarray(foot)
+        tuple(turns), others, axis / np.linalg.norm(axis), np.asarray(foot)
     )
+
+
+def _nearly_opposite(
+    base_from_flange: Floats, tolerance: float
+) -> list[tuple[int, int]]:
+    """Pairs of stations that a turn by about 180 degrees joins, the nearest first."""
+    rotations = base_from_flange[:, :3, :3].reshape(-1, 9)
+    # The trace of the turn between two stations is 1 + 2 cos(angle).
+    most = 1 + 2 * np.cos(np.pi - tolerance) + 1e-9
+    pairs = []
+    for apart in range(1, min(_MOST_APART, len(rotations) - 1) + 1):
+        traces = (rotations[:-apart] * rotations[apart:]).sum(axis=1)
+        pairs += [(int(j), int(j) + apart) for j in np.flatnonzero(traces <= most)]
+    return pairs
+
+
+def _support(turns: Sequence[Turn], tolerance: TurnTolerance) -> NDArray[np.intp]:
+    """How many turns agree with each, itself among them, shape (n,)."""
+    axes = np.array([turn.axis for turn in turns]).reshape(-1, 3)
+    feet = np.array([turn.foot for turn in turns]).reshape(-1, 3)
+    moved = np.array([abs(turn.pitch) for turn in turns]) > tolerance.length
+    support = np.zeros(len(turns), dtype=np.intp)
+    for k in np.flatnonzero(~moved):
+        near = np.abs(axes @ axes[k]) >= np.cos(tolerance.angle)
+        near &= np.linalg.norm(feet - feet[k], axis=1) <= tolerance.length
+        support[k] = (near & ~moved).sum()
+    return support
+
+
+def _others(
+    candidates: Sequence[Turn],
+    leader: Turn | None,
+    turns: Sequence[Turn],
+    tolerance: TurnTolerance,
+) -> tuple[str, ...]:
+    """Why turns of successive stations are none of those taken."""
+    of = {station: turn for turn in turns for station in (turn.before, turn.after)}
+    others = []
+    for turn in candidates:
+        if turn.after > turn.before + 1 or turn in turns:
+            continue
+        why = _difference(leader or turn, turn, tolerance)
+        if not why:
+            station = turn.before if turn.before in of else turn.after
+            other = of[station]
+            why = f"station {station} already belongs to {other.before}-{other.after}"
+        others.append(f"{turn.before}-{turn.after}: {why}")
+    return tuple(others)
 
 
 def _difference(rig: Turn, turn: Turn, tolerance: TurnTolerance) -> str:
