@@ -27,11 +27,11 @@ from simulated_calibrations import (  # noqa: E402
     by_block,
     by_quantity,
     calibrated,
-    planned_stations,
     predictions,
     ratio,
     simulated,
     squared_errors,
+    to_calibrate,
     workspace_test,
 )
 
@@ -53,9 +53,7 @@ def check(name: str, runs: int) -> list[str]:
     errors = []
     for run in range(runs):
         rng = np.random.default_rng([5, run])
-        session, truth = simulated(
-            cell, model, planned_stations(plan), plan.half_turns, rng
-        )
+        session, truth = simulated(cell, model, *to_calibrate(plan), rng)
         test = workspace_test(cell, model, rng)
         errors.append(squared_errors(calibrated(session), truth, test))
     seconds = time.perf_counter() - started

@@ -25,10 +25,10 @@ sys.path.insert(0, str(REPO / "tests" / "plan"))
 from random_plans import RandomPlans  # noqa: E402
 from simulated_calibrations import (  # noqa: E402
     calibrated,
-    planned_stations,
     predictions,
     ratio,
     simulated,
+    to_calibrate,
     workspace_test,
 )
 
@@ -73,8 +73,7 @@ def check(name, sigma_px, runs, draws):
         over_bound = track / plan.certificate["relaxed_bound_mm"]
         mine, theirs = [], []
         for run in range(runs):
-            stations = planned_stations(plan)
-            mine.append(own_part(cell, model, stations, plan.half_turns, [3, run]))
+            mine.append(own_part(cell, model, *to_calibrate(plan), [3, run]))
             programme = random.programme(drawn[run % draws], cell)
             theirs.append(own_part(cell, model, *programme, [3, run]))
         found = ratio(np.array(mine) / track**2)

@@ -20,8 +20,6 @@ _BATCH = 400
 _MOST_POSES = 12000
 # A cell in which none of this many poses passes has no plan.
 _HOPELESS = 1200
-# Inverse solutions of a pose that are tried, nearest to those before first.
-_SOLUTIONS = 4
 _STARTS = 9
 # The sphere to see whole is larger than the marker by this factor: blur and the
 # detector's window reach beyond the outline.
@@ -39,15 +37,12 @@ class Prospect:
         base_from_flange: Shape (s, 4, 4), metres: s = 2 before and after a
             half-turn, else 1.
         seen: Which cameras have all markers well in their images, shape (m,).
-        before: Joints by solution, shape (k, q), rad or m.
-        after: For each of them those after the half-turn, shapes (t, q); empty
-            for a single station.
+        joints: Joints at the stations by solution, shape (k, s, q), rad or m.
     """
 
     base_from_flange: Floats
     seen: Flags
-    before: Floats
-    after: tuple[Floats, ...]
+    joints: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,12 +60,6 @@ class Candidate:
     base_from_flange: Floats
     normal: Floats
     seen: Flags
-
-    def turned_round(self) -> Candidate:
-        """The same driven the other way."""
-        return Candidate(
-            self.joints[::-1], self.base_from_flange[::-1], self.normal, self.seen
-        )
 
 
 class CandidateSearch:
@@ -103,24 +92,27 @@ class CandidateSearch:
         self.rejected: Counter[str] = Counter() if rejected is None else rejected
         self.drawn = 0
 
-    def find(self, wanted: int, *, turns: bool) -> list[Candidate]:
-        """Search until enough candidates are found or hope is lost.
+    def find(
+        self, wanted: int, *, turns: bool, solutions: int = 1
+    ) -> list[list[Candidate]]:
+        """Search until enough places are found or hope is lost.
 
         Args:
             wanted: How many.
-            turns: Whether a candidate is a half-turn (else one station).
+            turns: Whether a place is that of a half-turn (else of one station).
+            solutions: How many free solutions of each to look for.
 
         Returns:
-            Up to ``wanted`` candidates, in the order drawn.
+            Free solutions of up to ``wanted`` places, in the order drawn.
         """
-        found: list[Candidate] = []
+        found: list[list[Candidate]] = []
         while len(found) < wanted and self.drawn < _MOST_POSES:
             if not found and self.drawn >= _HOPELESS:
                 break
             for prospect in self._solved(turns):
-                candidate = self.first_free(prospect)
-                if candidate is not None:
-                    found.append(candidate)
+                free = self.free(prospect, solutions)
+                if free:
+                    found.append(free)
                 if len(found) == wanted:
                     break
         return found
@@ -171,40 +163,38 @@ class CandidateSearch:
         joints = [before.joints[k] for k in places]
         if not turns:
             return [
-                Prospect(targets[k][None], seen[k], q, ())
+                Prospect(targets[k][None], seen[k], q[:, None])
                 for k, q in zip(places, joints, strict=True)
             ]
         possible = [
-            Prospect(
-                np.stack([targets[k], targets[k] @ HALF_TURN]), seen[k], q, tuple(after)
-            )
-            for k, q, after in zip(places, joints, self._turned(joints), strict=True)
-            if any(len(ends) for ends in after)
+            Prospect(np.stack([targets[k], targets[k] @ HALF_TURN]), seen[k], both)
+            for k, both in zip(places, self._turned(joints), strict=True)
+            if len(both)
         ]
         self.rejected["half_turn"] += len(places) - len(possible)
         return possible
 
-    def _turned(self, poses: list[Floats]) -> list[list[Floats]]:
-        """Joints after the half-turn, for each solution (s, q) of each pose.
+    def _turned(self, poses: list[Floats]) -> list[Floats]:
+        """Joints before and after the half-turn, (t, 2, q), of each pose's (s, q).
 
         The last joint turns where its axis is the flange's and its limits allow;
         otherwise inverse kinematics, and the solution nearest to the one before.
         """
         arm = self._arm
         result = [self._by_last_joint(joints) for joints in poses]
-        missing = [k for k, after in enumerate(result) if not any(map(len, after))]
+        missing = [k for k, both in enumerate(result) if not len(both)]
         if missing:
             targets = np.array([arm.forward(poses[k][0]) @ HALF_TURN for k in missing])
             found = arm.inverse(targets, self._rng, starts=_STARTS).joints
             for k, others in zip(missing, found, strict=True):
-                result[k] = [
-                    others[np.argsort(np.linalg.norm(others - q, axis=1))[:1]]
-                    for q in poses[k]
-                ]
+                if len(others):
+                    gap = np.linalg.norm(poses[k][:, None] - others, axis=-1)
+                    nearest = others[gap.argmin(axis=1)]
+                    result[k] = np.stack([poses[k], nearest], axis=1)
         return result
 
-    def _by_last_joint(self, joints: Floats) -> list[Floats]:
-        """The last joint turned by pi either way, where that is a half-turn."""
+    def _by_last_joint(self, joints: Floats) -> Floats:
+        """Those whose last joint turned by pi makes the half-turn, (t, 2, q)."""
         arm = self._arm
         tries = np.repeat(joints[:, None], 2, axis=1)
         tries[..., -1] += (-np.pi, np.pi)
@@ -212,43 +202,39 @@ class CandidateSearch:
         off = np.abs(arm.forward(tries) - target).max(axis=(-1, -2))
         inside = ((tries >= arm.lower) & (tries <= arm.upper)).all(axis=-1)
         usable = (off < _SAME_POSE) & inside
-        return [
-            turned[keep][np.argsort(np.abs(turned[keep][:, -1]), kind="stable")]
-            for turned, keep in zip(tries, usable, strict=True)
-        ]
+        after = tries[np.arange(len(tries)), usable.argmax(axis=1)]
+        both = np.stack([joints, after], axis=1)
+        return np.asarray(both[usable.any(axis=1)])
 
-    def first_free(self, prospect: Prospect) -> Candidate | None:
-        """The first solution that no solid forbids; else count what forbade it.
+    def free(self, prospect: Prospect, most: int) -> list[Candidate]:
+        """Solutions that no solid forbids; if none, count what forbade them.
 
-        Solutions nearest to the last free one come first.
+        Those nearest to the last free one come first.
+
+        Args:
+            prospect: Where.
+            most: How many solutions to look for.
         """
-        before = prospect.before
-        order = np.argsort(np.linalg.norm(before - self._anchor, axis=1))
+        gaps = np.linalg.norm(prospect.joints[:, 0] - self._anchor, axis=1)
+        found: list[Candidate] = []
         reasons: list[str] = []
-        for k in order[:_SOLUTIONS]:
-            for joints in _joints(prospect, k):
-                seen, reason = self._judged(joints, prospect.seen)
-                if reason is None:
-                    self._anchor = joints[-1]
-                    return self._candidate(prospect, joints, seen)
-                reasons.append(reason)
+        for k in np.argsort(gaps, kind="stable"):
+            joints = prospect.joints[k]
+            seen, reason = self._judged(joints, prospect.seen)
+            if reason is None:
+                found.append(self._candidate(prospect, joints, seen))
+                if len(found) == most:
+                    break
+            else:
+                reasons.append("occlusion" if reason == _BY_RIG else reason)
                 if reason == _BY_RIG:
                     # The rig hides its own marker: so it does in every solution.
-                    self.rejected["occlusion"] += 1
-                    return None
-        # The solution that came farthest speaks for the pose.
-        checks = ("half_turn", "occlusion", "collision", "turn_path")
-        self.rejected[max(reasons, key=checks.index, default="half_turn")] += 1
-        return None
-
-    def all_free(self, prospect: Prospect) -> list[Candidate]:
-        """Every solution that no solid forbids."""
-        found = []
-        for k in range(len(prospect.before)):
-            for joints in _joints(prospect, k):
-                seen, reason = self._judged(joints, prospect.seen)
-                if reason is None:
-                    found.append(self._candidate(prospect, joints, seen))
+                    break
+        if found:
+            self._anchor = found[0].joints[-1]
+        else:
+            # The solution that came farthest speaks for the pose.
+            self.rejected[max(reasons, key=("collision", "occlusion").index)] += 1
         return found
 
     def _candidate(self, prospect: Prospect, joints: Floats, seen: Flags) -> Candidate:
@@ -259,6 +245,8 @@ class CandidateSearch:
     def _judged(self, joints: Floats, seen: Flags) -> tuple[Flags, str | None]:
         """Cameras left with a free sight, and the check that joints (s, q) fail."""
         arm, view = self._arm, self._view
+        if any(arm.collision(q) is not None for q in joints):
+            return seen, "collision"
         free, reason = seen.copy(), "occlusion"
         for i in np.flatnonzero(seen):
             blocker = self._blocker(joints, view.world_from_camera[i, :3, 3])
@@ -267,10 +255,6 @@ class CandidateSearch:
                 reason = _BY_RIG if blocker in arm.on_flange else "occlusion"
             if free.sum() < view.required:
                 return free, reason
-        if any(arm.collision(q) is not None for q in joints):
-            return free, "collision"
-        if len(joints) == 2 and arm.path_collision(*joints) is not None:
-            return free, "turn_path"
         return free, None
 
     def _blocker(self, joints: Floats, camera: Floats) -> str | None:
@@ -281,11 +265,3 @@ class CandidateSearch:
                 if blocker is not None:
                     return blocker
         return None
-
-
-def _joints(prospect: Prospect, solution: int) -> list[Floats]:
-    """Joints (s, q) of a solution: one for each way to turn."""
-    start = prospect.before[solution]
-    if not prospect.after:
-        return [start[None]]
-    return [np.stack([start, end]) for end in prospect.after[solution]]

@@ -63,7 +63,7 @@ def certify(
     The numbers are
 
     * ``sigma_px``: the detection error that the predictions assume,
-    * ``plane_spread_deg``: smallest angle between planes of successive half-turns,
+    * ``plane_spread_deg``: largest angle between planes of two half-turns,
     * ``axis_spread``: smallest over largest singular value of the rotation axes
       between stations (1: all directions alike, 0: in a plane),
     * ``rank``, ``unknowns``, ``condition`` (at most 1 over the machine's precision):
@@ -88,15 +88,9 @@ def certify(
     information = model.of_stations(base_from_flange, seen).sum(axis=0)
     values, vectors = _scaled_spectrum(information)
     covariance = model.covariance(information)
-    normals = model.view.normals(
-        np.linalg.inv(model.base_from_world) @ base_from_flange[turns[:, 0]]
-    )
-    spread = plane_angles(normals[:-1], normals[1:])
     numbers = {
         "sigma_px": model.sigma_px,
-        "plane_spread_deg": float(np.degrees(spread.min(initial=np.pi / 2)))
-        if len(turns) > 1
-        else 0.0,
+        "plane_spread_deg": plane_spread_deg(model, base_from_flange[turns[:, 0]]),
         "axis_spread": axis_spread(base_from_flange[:, :3, :3]),
         "rank": float((values > _NO_INFORMATION).sum()),
         "unknowns": float(len(values)),
@@ -187,8 +181,9 @@ def _findings(
         )
     elif numbers["plane_spread_deg"] < least:
         found.append(
-            f"two successive half-turns' planes are {numbers['plane_spread_deg']:.1f} "
-            f"degrees apart, needs {least:.0f} (Proposition 1)"
+            "the half-turns' planes are at most "
+            f"{numbers['plane_spread_deg']:.1f} degrees apart, needs {least:.0f} "
+            "(Proposition 1)"
         )
     for camera in cell.cameras:
         sigma = numbers[f"sigma.{camera.name}.fx_px"]
@@ -261,6 +256,14 @@ def _described(view: View, world_from_flange: Floats) -> str:
         f"degrees against camera {name}'s image, about the image direction "
         f"{axis:.0f} degrees from its x axis"
     )
+
+
+def plane_spread_deg(model: StationInformation, base_from_flange: Floats) -> float:
+    """Largest angle between the triangle's planes at stations (n, 4, 4), degrees."""
+    world = np.linalg.inv(model.base_from_world) @ base_from_flange
+    normals = model.view.normals(world)
+    angles = plane_angles(normals[:, None], normals[None])
+    return float(np.degrees(angles.max(initial=0.0)))
 
 
 def axis_spread(rotations: Floats) -> float:

@@ -13,14 +13,13 @@ from handeye_tri.arm import Arm
 from handeye_tri.config import Cell
 from handeye_tri.errors import InputError, NoPlanError
 from handeye_tri.plan.candidates import Candidate, CandidateSearch, Prospect
-from handeye_tri.plan.certificate import MIN_AXIS_SPREAD, certify
+from handeye_tri.plan.certificate import MIN_AXIS_SPREAD, certify, plane_spread_deg
 from handeye_tri.plan.design import Design
 from handeye_tri.plan.information import StationInformation
-from handeye_tri.plan.poses import View, plane_angles
+from handeye_tri.plan.poses import View
 from handeye_tri.plan.refusal import no_plan
-from handeye_tri.plan.route import RoutePlanner
-from handeye_tri.plan.selection import Selector
-from handeye_tri.plan.sequence import Stops
+from handeye_tri.plan.route import RoutePlanner, Stop
+from handeye_tri.plan.selection import Selection, Selector
 from handeye_tri.records import HalfTurn, Plan, Station
 from handeye_tri.se3 import SE3
 
@@ -32,8 +31,8 @@ _POOL = 90
 _LARGEST_POOL = 1000
 # Selections that are tried before a cell is given up.
 _SELECTIONS = 6
-# Ways to reach a half-turn that the order may choose from, senses included.
-_OPTIONS = 12
+# Solutions of a place that the order may choose from.
+_SOLUTIONS = 6
 
 
 def plan_motions(
@@ -43,17 +42,19 @@ def plan_motions(
     half_turns: int | None = None,
     progress: Progress | None = None,
 ) -> Plan:
-    """Plan half-turns joined by general motions, then evaluation stations.
+    """Plan half-turns joined by general motions, and evaluation stations.
 
     Every station is within the joint limits, free of collision with clearance, and
     shows all markers' outlines unhidden and with margin to two cameras or more (or to
     the only one), at an allowed tilt; the two stations of a half-turn differ by 180
-    degrees about the flange's z axis; successive half-turns' planes enclose at least
-    ``plan.min_plane_spread_deg`` (Zhao, Liu and Zhang 2008, Proposition 1,
-    doi:10.1109/TIP.2008.2005562); ways from station to station are free, straight in
-    joint space or past the points in ``via``. Among what passes, those half-turns
-    are chosen that make the calibration's part of the predicted track error over the
-    workspace box least, and the order that takes the least time.
+    degrees about the flange's z axis, by the same solution of the arm; planes of the
+    half-turns differ by ``plan.min_plane_spread_deg`` or more (Zhao, Liu and Zhang
+    2008, Proposition 1, doi:10.1109/TIP.2008.2005562); ways from station to station
+    are free, straight in joint space or past the points in ``via``. Among what
+    passes, those half-turns are chosen that make the calibration's part of the
+    predicted track error over the workspace box least, and the order of all stations
+    that takes the least time: the two of a half-turn may be apart, and evaluation
+    stations lie among the others.
 
     The certificate holds what :func:`~handeye_tri.plan.certificate.certify` predicts
     from the stations, and
@@ -185,10 +186,9 @@ class _Planner:
             raise self._no_plan(
                 search.drawn, f"{len(pool)} of {self.wanted} half-turns found"
             )
-        chosen, via, bound = self._choose_and_order(pool, search)
-        self._done(self.pool_size + self.wanted)
-        evaluation, further = self._evaluation(chosen[-1].joints[-1])
-        plan = self._record(chosen, evaluation, [*via, *further], bound, len(pool))
+        selector, selection = self._choose(pool, search)
+        route = self._route(pool, search, selector, selection.chosen)
+        plan = self._record(route, selection.bound, len(pool))
         self._done(self.total)
         return plan
 
@@ -196,10 +196,10 @@ class _Planner:
         rng = np.random.default_rng([self.seed, stream])
         return CandidateSearch(self.view, self.arm, rng, self.rejected)
 
-    def _choose_and_order(
+    def _choose(
         self, pool: Sequence[Prospect], search: CandidateSearch
-    ) -> tuple[list[Candidate], list[Floats], float]:
-        """The half-turns in their order, the ways there, the bound on their cost."""
+    ) -> tuple[Selector, Selection]:
+        """The half-turns that tell most, free of solids."""
         checks = 0
 
         def checked() -> None:
@@ -241,130 +241,118 @@ class _Planner:
                 f"{selector.usable.sum()} of {self.wanted} half-turns are free",
                 by_solids.most_common(1)[0][0],
             )
-        chosen: list[int] | None = selection.chosen
-        for _ in range(_SELECTIONS):
-            if chosen is None:
-                break
-            order = self._order([search.all_free(pool[k]) for k in chosen])
-            if not isinstance(order, int):
-                return *order, selection.bound
-            chosen = selector.replace(chosen, chosen[order])
-        most = "path" if self.rejected["path"] else "plane_spread"
-        raise self._no_plan(
-            len(pool), "no order of half-turns drives free from one to the next", most
-        )
+        return selector, selection
 
-    def _order(
-        self, ways: list[list[Candidate]]
-    ) -> tuple[list[Candidate], list[Floats]] | int:
-        """The half-turns in the order of least time, or the one that is in the way.
+    def _route(
+        self,
+        pool: Sequence[Prospect],
+        search: CandidateSearch,
+        selector: Selector,
+        chosen: list[int],
+    ) -> list[tuple[Candidate, Stop]]:
+        """Stations of half-turns and of evaluation in the order of least time.
 
-        Planes of successive half-turns spread enough, and the way between them is
-        free; each is driven in one of its two senses.
-
-        Args:
-            ways: Free solutions of each half-turn.
+        What no free way leads to is replaced.
         """
-        least = np.radians(self.cell.plan.min_plane_spread_deg)
-        options = [
-            each
-            for some in ways
-            for way in some[: _OPTIONS // 2]
-            for each in (way, way.turned_round())
-        ]
-        stop = np.array(
-            [k for k, some in enumerate(ways) for _ in some[: _OPTIONS // 2] * 2]
-        )
-        begin = np.array([c.joints[0] for c in options])
-        end = np.array([c.joints[1] for c in options])
-        normals = np.array([c.normal for c in options])
-        spread = plane_angles(normals[:, None], normals[None]) >= least
-        times = np.where(spread, self.route.time(end[:, None], begin[None]), np.inf)
-        start = self.visited.joints
-        first = self.route.time(start, begin)
-        if len(self.visited.turns):
-            before = self.visited.base_from_flange[self.visited.turns[-1, :1]]
-            world = self.arm.base_from_world.inverse().matrix @ before
-            apart = plane_angles(self.view.normals(world), normals)
-            first = np.where(apart >= least, first, np.inf)
-        stops = Stops(stop, first, times)
-        route = self.route.drive(stops, start, begin, end)
-        if route is not None:
-            return [options[k] for k in route.order], route.via
-        return int(np.argmin(np.bincount(stop, np.isfinite(times).sum(axis=1))))
-
-    def _evaluation(self, start: Floats) -> tuple[list[Candidate], list[Floats]]:
-        """Stations anywhere in the workspace, in the order of least time."""
-        wanted = self.held_out
-        if wanted == 0:
-            return [], []
-        search = self._search(1)
-        # Some more than wanted: the way to one may be blocked.
-        found = search.find(2 * wanted, turns=False)
-        while len(found) >= wanted:
-            joints = np.array([c.joints[0] for c in found[:wanted]])
-            times = self.route.time(joints[:, None], joints[None])
-            stops = Stops(np.arange(wanted), self.route.time(start, joints), times)
-            route = self.route.drive(stops, start, joints, joints)
-            if route is not None:
-                return [found[k] for k in route.order], route.via
-            found.pop(int(np.argmin(np.isfinite(times).sum(axis=0))))
+        self._done(self.pool_size + self.wanted)
+        held_out = self._held_out()
+        usual: list[int] | None = chosen
+        for _ in range(_SELECTIONS):
+            if usual is None or len(held_out) < self.held_out:
+                break
+            self._check_spread(pool, usual)
+            places = [search.free(pool[k], _SOLUTIONS) for k in usual]
+            places += held_out[: self.held_out]
+            joints = [[c.joints for c in solutions] for solutions in places]
+            route = self.route.drive(joints, self.visited.joints)
+            if not isinstance(route, int):
+                return [(places[s.place][s.solution], s) for s in route]
+            if route < self.wanted:
+                usual = selector.replace(usual, usual[route])
+            else:
+                held_out.pop(route - self.wanted)
         raise self._no_plan(
-            search.drawn, f"{len(found)} of {wanted} evaluation stations found"
+            len(pool), "no order of stations drives free from one to the next", "path"
         )
+
+    def _check_spread(self, pool: Sequence[Prospect], chosen: list[int]) -> None:
+        """Raise where all half-turns' planes are nearly parallel."""
+        poses = np.concatenate(
+            [
+                self.visited.base_from_flange[self.visited.turns[:, 0]],
+                [pool[k].base_from_flange[0] for k in chosen],
+            ]
+        )
+        spread = plane_spread_deg(self.model, poses)
+        if len(poses) > 1 and spread < self.cell.plan.min_plane_spread_deg:
+            self.rejected["plane_spread"] += 1
+            raise self._no_plan(
+                len(pool), f"planes differ by {spread:.0f} degrees only", "plane_spread"
+            )
+
+    def _held_out(self) -> list[list[Candidate]]:
+        """Stations anywhere in the workspace, some more than wanted."""
+        if self.held_out == 0:
+            return []
+        search = self._search(1)
+        found = search.find(2 * self.held_out, turns=False, solutions=_SOLUTIONS)
+        if len(found) < self.held_out:
+            raise self._no_plan(
+                search.drawn,
+                f"{len(found)} of {self.held_out} evaluation stations found",
+            )
+        return found
 
     def _record(
-        self,
-        chosen: list[Candidate],
-        evaluation: list[Candidate],
-        ways: list[Floats],
-        bound: float,
-        pool: int,
+        self, route: list[tuple[Candidate, Stop]], bound: float, pool: int
     ) -> Plan:
-        calibration = [
-            Station(2 * k + step, "calibration", c.joints[step], SE3(pose))
-            for k, c in enumerate(chosen)
-            for step, pose in enumerate(c.base_from_flange)
-        ]
-        held_out = [
-            Station(k, "evaluation", c.joints[0], SE3(c.base_from_flange[0]))
-            for k, c in enumerate(evaluation, len(calibration))
-        ]
-        turns = tuple(
-            HalfTurn(2 * k, 2 * k + 1, self.cell.rig.axis) for k in range(len(chosen))
+        stations = tuple(
+            Station(
+                k,
+                "calibration" if stop.place < self.wanted else "evaluation",
+                stop.joints,
+                SE3(candidate.base_from_flange[stop.step]),
+            )
+            for k, (candidate, stop) in enumerate(route)
         )
-        seen = len(self.visited.base_from_flange)
-        added = seen + np.arange(2 * len(chosen)).reshape(-1, 2)
+        visits: dict[int, list[int]] = {}
+        for k, (_, stop) in enumerate(route):
+            visits.setdefault(stop.place, []).append(k)
+        pairs = sorted(pair for place, pair in visits.items() if place < self.wanted)
+        used = [k for k, s in enumerate(stations) if s.kind == "calibration"]
+        before = len(self.visited.base_from_flange)
         certified = certify(
             self.cell,
             self.model,
             np.concatenate(
-                [self.visited.base_from_flange, *(c.base_from_flange for c in chosen)]
+                [
+                    self.visited.base_from_flange,
+                    [route[k][0].base_from_flange[route[k][1].step] for k in used],
+                ]
             ),
+            np.concatenate([self.visited.seen, [route[k][0].seen for k in used]]),
             np.concatenate(
-                [self.visited.seen, *(np.stack([c.seen, c.seen]) for c in chosen)]
+                [self.visited.turns, before + np.searchsorted(used, np.array(pairs))]
             ),
-            np.concatenate([self.visited.turns, added]),
         )
         certificate = dict(certified.numbers)
         certificate["relaxed_bound_mm"] = float(1e3 * np.sqrt(bound))
         certificate["candidates"] = float(pool)
-        via = self._via(ways, len(chosen))
-        joints = [s.joints for s in (*calibration, *held_out)]
-        route = np.array(
+        via = tuple(stop.via for _, stop in route)
+        points = np.concatenate(
             [
-                self.visited.joints,
-                *(q for v, s in zip(via, joints, strict=True) for q in (*v, s)),
+                self.visited.joints[None],
+                *(np.concatenate([stop.via, stop.joints[None]]) for _, stop in route),
             ]
         )
-        times = self.route.time(route[:-1], route[1:])
+        times = self.route.time(points[:-1], points[1:])
         certificate["cycle_time_s"] = float(times.sum())
         if certificate["axis_spread"] < MIN_AXIS_SPREAD:
             self.rejected["axis_spread"] += 1
             raise self._no_plan(1, "the rotations do not span 3-D", "axis_spread")
         return Plan(
-            (*calibration, *held_out),
-            turns,
+            stations,
+            tuple(HalfTurn(a, b, self.cell.rig.axis) for a, b in pairs),
             dict(self.rejected),
             certificate,
             self.seed,
@@ -372,12 +360,6 @@ class _Planner:
             certified.findings,
             via,
         )
-
-    def _via(self, ways: list[Floats], half_turns: int) -> tuple[Floats, ...]:
-        """Points to pass by station: a half-turn itself is driven straight."""
-        straight = np.zeros((0, len(self.arm.home)))
-        turns = [v for way in ways[:half_turns] for v in (way, straight)]
-        return (*turns, *ways[half_turns:])
 
     def _no_plan(self, drawn: int, what: str, check: str | None = None) -> NoPlanError:
         return no_plan(self.cell.name, self.rejected, drawn, what, check)

@@ -17,7 +17,6 @@ _REMEDY = {
     "collision": "give the arm room: move what stands in the cell or the workspace box",
     "occlusion": "uncover the markers: move the cameras, what stands between, or the "
     "rig farther ahead of the flange",
-    "turn_path": "give the turning rig room: move what stands in the cell",
     "plane_spread": "lower plan.min_plane_spread_deg or raise plan.max_tilt_deg",
     "path": "give the arm room between stations: move what stands in the cell",
     "axis_spread": "raise plan.max_tilt_deg: the stations hardly turn against another",

@@ -1,45 +1,54 @@
-"""The way through all stops: in which order, and past what."""
+"""The way through all stations: in which order, by which joints, and past what."""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.arm import Arm
 from handeye_tri.plan.paths import can_go_round, way_round
-from handeye_tri.plan.sequence import Stops, shortest_order, travel_time
+from handeye_tri.plan.sequence import Visits, shortest_order, travel_time
 
 Floats = NDArray[np.float64]
 
-# Moves whose straight way is checked before an order is given up.
-_STRAIGHT = 400
-# Moves for which a way round about is searched.
-_ROUND = 40
+# How long an order is searched for at first, and after moves turned out blocked.
+_ROUNDS = 1000
+_MORE_ROUNDS = 100
+# Orders that are tried before it is given up.
+_ORDERS = 80
+# The start in place of an option; also the last of the configurations.
+_START = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Route:
-    """Stops in their order.
+class Stop:
+    """A station on the way.
 
     Attributes:
-        order: Options of the stops, as in Stops.
-        via: Points to pass on the way to each, shapes (k, q), rad or m.
+        place: Which place it belongs to.
+        step: Which of the place's stations it is.
+        solution: By which of the place's solutions the arm stands there.
+        joints: Shape (q,), rad or m.
+        via: Points to pass on the way there, shape (k, q), rad or m.
     """
 
-    order: list[int]
-    via: list[Floats]
+    place: int
+    step: int
+    solution: int
+    joints: Floats
+    via: Floats
 
 
 class RoutePlanner:
-    """Orders stops by time along ways that nothing stands in.
+    """Orders stations by time along ways that nothing stands in.
 
     Attributes:
-        rejected: Counts straight ways that something stands in as "path", and orders
-            that cannot be driven as "plane_spread".
+        rejected: Counts straight ways that something stands in, as "path".
     """
 
     def __init__(
@@ -56,69 +65,123 @@ class RoutePlanner:
         return travel_time(start, end, self._arm.speed, self._acceleration_time)
 
     def drive(
-        self, stops: Stops, start: Floats, begin: Floats, end: Floats
-    ) -> Route | None:
-        """The order of least time, or None where there is none.
+        self, places: Sequence[Sequence[Floats]], start: Floats
+    ) -> list[Stop] | int:
+        """All stations of all places in the order of least time.
 
-        Straight ways only, as long as they suffice; then ways round about, where
-        OMPL is installed.
+        The stations of a place may be apart in the order, but are reached by the
+        same solution: what the arm's model has wrong is then alike in both. The last
+        joint may be a whole turn off where its limits allow. Straight ways only, as
+        long as they suffice; then ways round about, where OMPL is installed.
 
         Args:
-            stops: What moves cost if their straight ways are free; moves that turn
-                out not to be are changed in it.
+            places: For each its solutions, shapes (s, q): the joints at its s
+                stations.
             start: Where the arm comes from, shape (q,).
-            begin: Joints at which options begin, shape (k, q).
-            end: Joints at which they end, shape (k, q).
+
+        Returns:
+            The stations in their order, or the place that is most in the way.
         """
-        free: set[tuple[int, int]] = set()
-        blocked: list[tuple[int, int]] = []
-        round_about: dict[tuple[int, int], Floats] = {}
-        empty = np.zeros((0, len(start)))
-        while len(free) + len(blocked) < _STRAIGHT:
-            order = shortest_order(stops)
-            if order is None:
-                if not blocked or not can_go_round():
-                    break
-                self._go_round(stops, start, begin, end, blocked, round_about)
-                blocked = []
-                continue
-            moves = list(pairwise([-1, *order]))
-            open_question = [m for m in moves if m not in free | set(round_about)]
-            for a, b in open_question:
-                origin = start if a < 0 else end[a]
-                if self._arm.path_collision(origin, begin[b]) is None:
-                    free.add((a, b))
-                    continue
-                self.rejected["path"] += 1
-                blocked.append((a, b))
-                self._set(stops, a, b, np.inf)
-            if free.issuperset(open_question):
-                return Route(order, [round_about.get(m, empty) for m in moves])
-        self.rejected["plane_spread"] += not blocked
-        return None
+        stops, ways = self._options(places)
+        joints = np.array([stop.joints for stop in stops])
+        visits = Visits(
+            ways, self.time(start, joints), self.time(joints[:, None], joints[None])
+        )
+        moves = _Moves(self._arm, np.concatenate([joints, start[None]]), self._seed)
+        order = shortest_order(visits, self._seed, _ROUNDS)
+        for _ in range(_ORDERS):
+            wanted = list(pairwise([_START, *order.options]))
+            blocked = [move for move in wanted if not moves.free(*move)]
+            if not blocked:
+                return [replace(stops[b], via=moves.via[a, b]) for a, b in wanted]
+            if np.isfinite(order.seconds):
+                self.rejected["path"] += len(blocked)
+            elif not any([moves.lead_round(*move) for move in blocked]):
+                # No order does without them, and there is no way round.
+                ends = {stops[k].place for move in blocked for k in move if k >= 0}
+                barred = np.isinf(visits.times).sum(axis=1) + np.isinf(visits.first)
+                return max(ends, key=lambda place: int(barred[ways[place]].max()))
+            for a, b in blocked:
+                seconds = self._seconds(moves, a, b)
+                if a == _START:
+                    visits.first[b] = seconds
+                else:
+                    visits.times[a, b] = visits.times[b, a] = seconds
+            order = shortest_order(visits, self._seed, _MORE_ROUNDS, order)
+        return stops[order.options[-1]].place
 
-    def _go_round(
-        self,
-        stops: Stops,
-        start: Floats,
-        begin: Floats,
-        end: Floats,
-        blocked: list[tuple[int, int]],
-        found: dict[tuple[int, int], Floats],
-    ) -> None:
-        """Search ways round about for the moves that were wanted first."""
-        for a, b in blocked[:_ROUND]:
-            origin = start if a < 0 else end[a]
-            via = way_round(self._arm, origin, begin[b], self._seed)
-            if via is None:
-                continue
-            found[a, b] = via
-            points = np.concatenate([origin[None], via, begin[b][None]])
-            self._set(stops, a, b, float(self.time(points[:-1], points[1:]).sum()))
+    def _options(
+        self, places: Sequence[Sequence[Floats]]
+    ) -> tuple[list[Stop], list[NDArray[np.intp]]]:
+        """Every way to stand at every station, and those that go together."""
+        stops: list[Stop] = []
+        ways = []
+        none = np.zeros((0, len(self._arm.home)))
+        for place, solutions in enumerate(places):
+            together: list[tuple[int, ...]] = []
+            for solution, stations in enumerate(solutions):
+                numbers = []
+                for step, joints in enumerate(stations):
+                    variants = self._turned(joints)
+                    numbers.append(range(len(stops), len(stops) + len(variants)))
+                    stops += [Stop(place, step, solution, q, none) for q in variants]
+                together += product(*numbers)
+            ways.append(np.array(together))
+        return stops, ways
 
-    @staticmethod
-    def _set(stops: Stops, a: int, b: int, seconds: float) -> None:
-        if a < 0:
-            stops.first[b] = seconds
-        else:
-            stops.times[a, b] = seconds
+    def _turned(self, joints: Floats) -> list[Floats]:
+        """The same with the last joint turned round wholly, within its limits."""
+        arm = self._arm
+        if arm.slides[-1]:
+            return [joints]
+        turns = np.zeros((3, len(joints)))
+        turns[:, -1] = (0.0, -2 * np.pi, 2 * np.pi)
+        inside = ((joints + turns >= arm.lower) & (joints + turns <= arm.upper)).all(1)
+        return list((joints + turns)[inside | (turns[:, -1] == 0)])
+
+    def _seconds(self, moves: _Moves, a: int, b: int) -> float:
+        via = moves.via.get((a, b))
+        if via is None:
+            return np.inf
+        points = np.concatenate([moves.joints[[a]], via, moves.joints[[b]]])
+        return float(self.time(points[:-1], points[1:]).sum())
+
+
+class _Moves:
+    """Which moves between configurations are free, looked at once.
+
+    Attributes:
+        joints: Configurations, shape (k, q), rad or m.
+        via: Points to pass, by free move, shapes (p, q).
+    """
+
+    def __init__(self, arm: Arm, joints: Floats, seed: int) -> None:
+        self._arm = arm
+        self._seed = seed
+        self._blocked: set[tuple[int, int]] = set()
+        self._hopeless: set[tuple[int, int]] = set()
+        self.joints = joints
+        self.via: dict[tuple[int, int], Floats] = {}
+
+    def free(self, a: int, b: int) -> bool:
+        """Whether a move is known to be free, or is free where it is straight."""
+        if (a, b) not in self.via and (a, b) not in self._blocked:
+            if self._arm.path_collision(self.joints[a], self.joints[b]) is None:
+                self._keep(a, b, np.zeros((0, self.joints.shape[1])))
+            else:
+                self._blocked |= {(a, b), (b, a)}
+        return (a, b) in self.via
+
+    def lead_round(self, a: int, b: int) -> bool:
+        """Search a way round about; whether there is one."""
+        if (a, b) in self._hopeless or not can_go_round():
+            return False
+        via = way_round(self._arm, self.joints[a], self.joints[b], self._seed)
+        if via is None:
+            self._hopeless |= {(a, b), (b, a)}
+            return False
+        self._keep(a, b, via)
+        return True
+
+    def _keep(self, a: int, b: int, via: Floats) -> None:
+        self.via[a, b], self.via[b, a] = via, via[::-1]

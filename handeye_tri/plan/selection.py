@@ -94,12 +94,13 @@ class Selector:
             return True
         if not self.usable[index]:
             return False
-        candidate = self._search.first_free(self._prospects[index])
+        free = self._search.free(self._prospects[index], 1)
         self.checked += 1
         self._progress()
-        if candidate is None:
+        if not free:
             self.usable[index] = False
             return False
+        candidate = free[0]
         self._found[index] = candidate
         if (candidate.seen != self._prospects[index].seen).any():
             # Something hides the rig from a camera, but not from too many.

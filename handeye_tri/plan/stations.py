@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from handeye_tri.arm import Arm
 from handeye_tri.config import Cell
@@ -31,8 +32,9 @@ _SHIFT_TOLERANCE = 0.5e-3
 def certify_stations(cell: Cell, arm: Arm, joints: ArrayLike) -> Plan:
     """Judge a list of stations as a plan is judged.
 
-    Half-turns are found in the stations themselves: successive ones that differ by
-    180 degrees about the flange's z axis. All stations are for calibration.
+    Half-turns are found in the stations themselves: any two that differ by 180
+    degrees about the flange's z axis, those nearest in order first. All stations are
+    for calibration.
 
     Args:
         cell: The cell.
@@ -88,17 +90,20 @@ def certify_stations(cell: Cell, arm: Arm, joints: ArrayLike) -> Plan:
 
 
 def _half_turns(poses: Floats) -> NDArray[np.intp]:
-    """Successive stations that differ by a half-turn, shape (k, 2); none twice."""
+    """Stations that differ by a half-turn, shape (k, 2); none twice."""
+    near = cKDTree(poses[:, :3, 3]).query_pairs(3 * _SHIFT_TOLERANCE)
     found: list[tuple[int, int]] = []
-    for k in range(len(poses) - 1):
-        if found and found[-1][1] == k:
+    used = set[int]()
+    for before, after in sorted(near, key=lambda pair: (pair[1] - pair[0], pair)):
+        if used & {before, after}:
             continue
-        turn = turn_between(poses, k, k + 1)
+        turn = turn_between(poses, before, after)
         tilt = np.arccos(min(1.0, abs(float(turn.axis[2]))))
         off = max(abs(turn.pitch), float(np.linalg.norm(turn.foot)))
         if max(abs(turn.miss), tilt) < _TURN_TOLERANCE and off < _SHIFT_TOLERANCE:
-            found.append((k, k + 1))
-    return np.array(found, dtype=np.intp).reshape(-1, 2)
+            found.append((before, after))
+            used |= {before, after}
+    return np.array(sorted(found), dtype=np.intp).reshape(-1, 2)
 
 
 def _forbidden(arm: Arm, view: View, joints: Floats, seen: Flags) -> list[str]:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from handeye_tri.arm import Arm
 from handeye_tri.config import Cell, parse_cell
 from handeye_tri.mechanism import Mechanism
@@ -13,6 +16,7 @@ from handeye_tri.records import Plan
 from handeye_tri.simulate import compile_mechanism
 from handeye_tri.storage.cells import read_cell
 
+Floats = NDArray[np.float64]
 REPO = Path(__file__).resolve().parents[2]
 CELLS = ("hp3_stereo", "hp3_stereo_edge", "hp3_stereo_lens", "hp3_stereo_mono")
 MODEL = REPO / "robot_models" / "hp3_like.xml"
@@ -33,8 +37,35 @@ def plan_of(name: str, seed: int = 1) -> Plan:
     return plan_motions(cell_of(name), arm_of(name), seed)
 
 
+def calibration_of(plan: Plan) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Joints (n, q) and poses (n, 4, 4) to calibrate from; half-turns among them."""
+    used = [s for s in plan.stations if s.kind == "calibration"]
+    turns = np.searchsorted(
+        [s.index for s in used], [(t.before, t.after) for t in plan.half_turns]
+    )
+    poses = np.array([s.base_from_flange.matrix for s in used])
+    return np.array([s.joints for s in used]), poses, turns
+
+
 def compiled(cell: Cell) -> Mechanism:
     return compile_mechanism(cell, MODEL)
+
+
+def seven_joints(directory: Path) -> Path:
+    """A model of seven joints: the HP3-like arm with a roll in its lower arm.
+
+    Its flange leans, so that the last joint's axis is not that of the half-turns.
+    """
+    text = MODEL.read_text()
+    lower_arm = '<joint name="l" axis="0 1 0" range="-85 90"/>'
+    flange = 'quat="0.7071067811865476 0 0.7071067811865476 0"'
+    assert text.count(lower_arm) == text.count(flange) == 1
+    text = text.replace(
+        lower_arm, lower_arm + '<joint name="roll" axis="0 0 1" range="-120 120"/>'
+    ).replace(flange, 'euler="0 105 0"')
+    model = directory / "seven.xml"
+    model.write_text(text)
+    return model
 
 
 def changed(name: str, **sections: object) -> Cell:

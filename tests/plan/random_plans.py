@@ -26,7 +26,7 @@ class RandomPlans:
     Half-turns are drawn without replacement from the first 250 that are feasible of
     ``CandidateSearch.find``: the rig's centre uniform in the workspace box, the
     triangle's tilt and spin uniform in what the cell allows, every check of a plan
-    passed (views, reach, limits, solids, the half-turn's own path).
+    passed (views, reach, limits, solids).
 
     Attributes:
         candidates: The feasible half-turns.
@@ -39,9 +39,8 @@ class RandomPlans:
     @classmethod
     def of(cls, cell: Cell, arm: Arm, model: StationInformation) -> RandomPlans:
         """Search once; what is drawn later is from the same half-turns."""
-        found = CandidateSearch(model.view, arm, np.random.default_rng(1)).find(
-            _FEASIBLE, turns=True
-        )
+        search = CandidateSearch(model.view, arm, np.random.default_rng(1))
+        found = [first for first, *_ in search.find(_FEASIBLE, turns=True)]
         information = model.of_half_turns(
             np.array([c.base_from_flange for c in found]),
             np.array([c.seen for c in found]),

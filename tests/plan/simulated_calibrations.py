@@ -231,6 +231,14 @@ def simulated(
     return asked(session, cell), truth
 
 
-def planned_stations(plan: Plan) -> tuple[Station, ...]:
-    """Those that calibrate."""
-    return tuple(s for s in plan.stations if s.kind == "calibration")
+def to_calibrate(plan: Plan) -> tuple[tuple[Station, ...], tuple[HalfTurn, ...]]:
+    """The stations that calibrate, and their half-turns, numbered without others."""
+    used = [s for s in plan.stations if s.kind == "calibration"]
+    number = {station.index: k for k, station in enumerate(used)}
+    return (
+        tuple(replace(s, index=k) for k, s in enumerate(used)),
+        tuple(
+            replace(t, before=number[t.before], after=number[t.after])
+            for t in plan.half_turns
+        ),
+    )

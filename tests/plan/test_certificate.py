@@ -25,9 +25,9 @@ def both(poses):
 
 
 def planned(name="hp3_stereo"):
-    plan = scene.plan_of(name)
-    poses = np.array([s.base_from_flange.matrix for s in plan.stations[:22]])
-    return poses, np.arange(22).reshape(-1, 2)
+    _, poses, turns = scene.calibration_of(scene.plan_of(name))
+    # The two of a half-turn beside each other.
+    return poses[turns.ravel()], np.arange(22).reshape(-1, 2)
 
 
 def test_a_good_plan_passes_without_findings():
@@ -151,13 +151,11 @@ def test_predicted_sigmas_are_those_of_simulated_adjustments():
     """60 runs know a sigma to 9 %; a block's pool to 3 to 6 %."""
     cell, model = scene.cell_of("hp3_stereo"), model_of()
     plan = scene.plan_of("hp3_stereo")
-    stations = simulated.planned_stations(plan)
+    stations, half_turns = simulated.to_calibrate(plan)
     errors = []
     for run in range(60):
         rng = np.random.default_rng([6, run])
-        session, truth = simulated.simulated(
-            cell, model, stations, plan.half_turns, rng
-        )
+        session, truth = simulated.simulated(cell, model, stations, half_turns, rng)
         test = simulated.workspace_test(cell, model, rng)
         found = simulated.from_truth(session, truth)
         errors.append(simulated.squared_errors(found, truth, test))

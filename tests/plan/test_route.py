@@ -4,17 +4,17 @@ from collections import Counter
 from functools import cache
 from itertools import pairwise
 
-import mujoco
 import numpy as np
 import planning_scene as scene
 import pytest
+from replayed import contacts, driven
 
 from handeye_tri.arm import Arm
 from handeye_tri.plan import plan_motions, route
 from handeye_tri.plan.paths import way_round
 from handeye_tri.plan.route import RoutePlanner
-from handeye_tri.plan.sequence import Stops
-from handeye_tri.simulate.compile import compile_cell
+from handeye_tri.records import Plan, Station
+from handeye_tri.se3 import SE3
 
 POST = {"name": "post", "size_mm": (60, 60, 900), "position_m": (0.42, 0.0, 0.45)}
 
@@ -40,53 +40,105 @@ def test_a_way_leads_round_what_stands_between():
     np.testing.assert_array_equal(way_round(arm, start, end, seed=3), via)
 
 
-def drive(arm, ends):
+def drive(arm, places, start):
     rejected = Counter()
-    planner = RoutePlanner(arm, 0.3, 1, rejected)
-    times = planner.time(ends[:, None], ends[None])
-    stops = Stops(np.arange(2), planner.time(ends[0], ends), times)
-    return planner.drive(stops, ends[0], ends, ends), rejected
+    return RoutePlanner(arm, 0.3, 1, rejected).drive(places, start), rejected
+
+
+def single(joints):
+    """A place of one station that is reached by one solution."""
+    return [joints[None]]
 
 
 def test_a_route_passes_points_only_where_it_must():
     arm, ends = obstructed()
-    found, rejected = drive(arm, ends)
-    assert found.order == [0, 1]
-    assert len(found.via[0]) == 0
-    assert len(found.via[1]) >= 1
+    found, rejected = drive(arm, [single(q) for q in ends], ends[0])
+    assert [stop.place for stop in found] == [0, 1]
+    assert [len(stop.via) > 0 for stop in found] == [False, True]
     assert rejected["path"] >= 1
-    free = np.array([ends[0], ends[0] + 0.01])
-    assert [len(via) for via in drive(arm, free)[0].via] == [0, 0]
+    near = [single(ends[0]), single(ends[0] + 0.01)]
+    assert [len(stop.via) for stop in drive(arm, near, ends[0])[0]] == [0, 0]
 
 
-def test_without_ompl_a_blocked_route_is_none(monkeypatch):
+def test_without_ompl_a_blocked_place_is_named(monkeypatch):
     monkeypatch.setattr(route, "can_go_round", lambda: False)
-    found, rejected = drive(*obstructed())
-    assert found is None
+    arm, ends = obstructed()
+    beside = ends[0] + 0.01
+    found, rejected = drive(arm, [single(q) for q in (*ends, beside)], ends[0])
+    assert found == 1
     assert rejected["path"] >= 1
+
+
+def test_the_wrist_goes_out_on_one_side_of_half_turns_and_back_on_the_other():
+    """Along a line: all stations before, one turn at its end, all stations after."""
+    arm = scene.arm_of("hp3_stereo")
+    place = np.array([0, 0.6, 0, 0, 0.3, -0.5])
+    step, turn = np.eye(6)[0], np.pi * np.eye(6)[5]
+    places = [
+        [np.array([place + 0.1 * k * step, place + 0.1 * k * step + turn])]
+        for k in (3, 1, 4, 0, 2)
+    ]
+    found, _ = drive(arm, places, places[3][0][0])
+    assert [stop.step for stop in found] == [0] * 5 + [1] * 5
+    assert [stop.place for stop in found] == [3, 1, 4, 0, 2, 2, 0, 4, 1, 3]
+
+
+def test_a_whole_turn_of_the_last_joint_is_left_out():
+    """The wrist would have to wind back; the same pose is a turn further on."""
+    arm = scene.arm_of("hp3_stereo")
+    start = np.array([0, 0.6, 0, 0, 0.3, np.radians(170)])
+    there = start - np.radians([0, 0, 0, 0, 0, 340])
+    found, _ = drive(arm, [single(there)], start)
+    np.testing.assert_allclose(found[0].joints, start + np.radians([0] * 5 + [20]))
+    np.testing.assert_allclose(
+        arm.forward(found[0].joints), arm.forward(there), atol=1e-12
+    )
+
+
+def test_both_stations_of_a_half_turn_are_reached_by_the_same_solution():
+    """Each station alone would be nearer by another solution."""
+    arm = scene.arm_of("hp3_stereo")
+    start = np.array([0, 0.6, 0, 0, 0.3, 0])
+    far = start + np.eye(6)[0]
+    place = [np.array([start, far]), np.array([far, start])]
+    found, _ = drive(arm, [place], start)
+    assert found[0].solution == found[1].solution
+
+
+def test_a_move_keeps_speed_and_acceleration():
+    """Each joint's limits, by differences; the slowest joint reaches both."""
+    speed, ramp = np.array([2.0, 1.0]), 0.3
+    for end in ([1.5, 0.4], [0.05, 0.3], [0.1, -0.1], [3.0, 2.0]):
+        joints = driven(np.zeros(2), np.array(end), speed, ramp)[:-1]
+        np.testing.assert_array_equal(joints[0], 0)
+        velocity = np.abs(np.diff(joints, axis=0)).max(axis=0) / 1e-3
+        force = np.abs(np.diff(joints, 2, axis=0)).max(axis=0) / 1e-6
+        assert (velocity <= speed * (1 + 1e-9)).all()
+        assert (force <= speed / ramp * (1 + 1e-6)).all()
+        assert (force / (speed / ramp)).max() == pytest.approx(1)
 
 
 @pytest.mark.parametrize("name", ["hp3_stereo", "hp3_stereo_edge"])
 def test_no_contact_at_a_thousand_steps_a_second(name):
-    """The whole programme from home, driven by trapezoids, in the other engine."""
+    """The whole programme from home, driven in the other engine."""
     cell, plan, arm = scene.cell_of(name), scene.plan_of(name), scene.arm_of(name)
-    model, _ = compile_cell(cell, scene.MODEL)
-    data = mujoco.MjData(model)
-    points = [arm.home]
-    for station, via in zip(plan.stations, plan.via, strict=True):
-        points += [*via, station.joints]
-    planner = RoutePlanner(arm, cell.arm.acceleration_time_s, 0, Counter())
-    contacts = steps = 0
-    for start, end in pairwise(points):
-        seconds = float(planner.time(start, end))
-        for part in np.linspace(0, 1, max(2, int(1000 * seconds))):
-            data.qpos[:] = start + part * (end - start)
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_collision(model, data)
-            contacts += int(data.ncon > 0 and data.contact.dist.min() <= 0)
-            steps += 1
-    assert contacts == 0
-    assert steps > 15_000
+    touching, steps = contacts(cell, scene.MODEL, arm, plan)
+    assert touching == 0
+    assert steps == pytest.approx(1e3 * plan.certificate["cycle_time_s"], rel=0.01)
+
+
+def test_a_way_through_a_solid_is_contact():
+    """What the count rests on: a straight way through the post is noticed."""
+    cell = scene.changed("hp3_stereo", surroundings=[POST])
+    arm, (start, end) = obstructed()
+    stations = [
+        Station(k, "calibration", q, SE3(arm.forward(q)))
+        for k, q in enumerate([start, end])
+    ]
+    none = np.zeros((0, 6))
+    plan = Plan(stations, (), {}, {}, 0, "PASS", (), (none, none))
+    touching, steps = contacts(cell, scene.MODEL, arm, plan)
+    assert 0.05 * steps < touching < steps
 
 
 def test_a_post_in_the_cell_leaves_a_plan_with_free_ways():

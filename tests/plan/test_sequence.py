@@ -5,65 +5,87 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 
-from handeye_tri.plan.sequence import Stops, shortest_order, travel_time
+from handeye_tri.plan.sequence import Visits, shortest_order, travel_time
+
+ROUNDS = 400
 
 
-def stops(seed, count, options, forbidden=0.0):
+def visits(seed, places, ways, forbidden=0.0):
+    """Random points in a square; each place a half-turn or a single station."""
     rng = np.random.default_rng(seed)
-    k = count * options
-    times = rng.random((k, k))
-    times[rng.random((k, k)) < forbidden] = np.inf
-    return Stops(np.repeat(np.arange(count), options), rng.random(k), times)
+    sizes = rng.integers(1, 3, places)
+    numbers = iter(range(1000))
+    groups = [
+        np.array([[next(numbers) for _ in range(size)] for _ in range(ways)])
+        for size in sizes
+    ]
+    k = next(numbers)
+    points = rng.random((k + 1, 2))
+    times = np.linalg.norm(points[:, None] - points, axis=-1)
+    first = times[k, :k].copy()
+    blocked = np.triu(rng.random((k, k)) < forbidden)
+    times = np.where(blocked | blocked.T, np.inf, times[:k, :k])
+    return Visits(groups, first, times)
 
 
 def duration(problem, order):
     return problem.first[order[0]] + problem.times[order[:-1], order[1:]].sum()
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize(("count", "options"), [(1, 3), (2, 2), (5, 3), (6, 2)])
-def test_the_order_is_the_best_of_all(seed, count, options):
-    problem = stops(seed, count, options, forbidden=0.3)
-    every = (
-        [p * options + c for p, c in zip(order, chosen, strict=True)]
-        for order in permutations(range(count))
-        for chosen in product(range(options), repeat=count)
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("places", "ways"), [(1, 3), (2, 2), (4, 2)])
+@pytest.mark.parametrize("forbidden", [0.0, 0.3])
+def test_the_order_is_the_best_of_all(seed, places, ways, forbidden):
+    problem = visits(seed, places, ways, forbidden)
+    best = min(
+        duration(problem, list(order))
+        for chosen in product(*problem.ways)
+        for order in permutations(np.concatenate(chosen))
     )
-    best = min(duration(problem, order) for order in every)
-    found = shortest_order(problem)
-    if np.isinf(best):
-        assert found is None
-    else:
-        assert duration(problem, found) == pytest.approx(best)
-        assert sorted(problem.stop[found]) == list(range(count))
+    found = shortest_order(problem, 0, ROUNDS)
+    assert found.seconds == pytest.approx(best)
+    if np.isfinite(best):
+        assert duration(problem, found.options) == pytest.approx(best)
 
 
-def test_a_long_programme_is_ordered_as_well_as_on_a_line():
-    """Stops on a line, in any order given: the best order goes along it once."""
+@pytest.mark.parametrize(("places", "ways"), [(1, 1), (9, 3), (30, 4)])
+def test_every_place_is_visited_once_by_one_of_its_ways(places, ways):
+    problem = visits(1, places, ways)
+    order = shortest_order(problem, 3, ROUNDS).options
+    chosen = [w for each in problem.ways for w in each if np.isin(w, order).all()]
+    assert len(chosen) == places
+    assert sorted(order) == sorted(np.concatenate(chosen))
+
+
+def test_places_on_a_line_are_visited_along_it():
+    """Both stations of a half-turn are passed once, whatever lies between them."""
     rng = np.random.default_rng(2)
     place = rng.permutation(40).astype(float)
     times = np.abs(place[:, None] - place[None])
-    problem = Stops(np.arange(40), place + 1, times)
-    order = shortest_order(problem)
-    np.testing.assert_array_equal(place[order], np.arange(40))
+    ways = [np.array([[2 * k, 2 * k + 1]]) for k in range(10)]
+    ways += [np.array([[k]]) for k in range(20, 40)]
+    order = shortest_order(Visits(ways, place + 1, times), 0, ROUNDS)
+    np.testing.assert_array_equal(place[order.options], np.arange(40))
+    assert order.seconds == pytest.approx(40)
 
 
-def test_a_long_programme_visits_everything_once_and_beats_the_nearest_next():
-    problem = stops(3, 25, 4)
-    order = shortest_order(problem)
-    assert sorted(problem.stop[order]) == list(range(25))
-    nearest = [int(np.argmin(problem.first))]
-    while len(nearest) < 25:
-        left = ~np.isin(problem.stop, problem.stop[nearest])
-        nearest.append(int(np.argmin(np.where(left, problem.times[nearest[-1]], 9))))
-    assert duration(problem, order) < duration(problem, nearest)
+def test_the_search_goes_on_from_an_order_and_is_never_worse():
+    problem = visits(5, 20, 4)
+    short = shortest_order(problem, 0, 5)
+    longer = shortest_order(problem, 1, 100, short)
+    assert longer.seconds < short.seconds
+    assert shortest_order(problem, 1, 100, short) == longer
 
 
-@pytest.mark.parametrize("count", [4, 14])
-def test_no_order_where_a_stop_cannot_be_reached(count):
-    problem = stops(0, count, 1)
-    problem.times[:, 2] = problem.first[2] = np.inf
-    assert shortest_order(problem) is None
+@pytest.mark.parametrize("places", [1, 6])
+def test_an_order_that_must_use_a_forbidden_move_takes_for_ever(places):
+    problem = visits(0, places, 2)
+    problem.first[problem.ways[-1]] = np.inf
+    problem.times[problem.ways[-1]] = np.inf
+    problem.times[:, problem.ways[-1]] = np.inf
+    found = shortest_order(problem, 0, ROUNDS)
+    assert found.seconds == np.inf
+    assert len(found.options) == sum(ways.shape[1] for ways in problem.ways)
 
 
 def test_a_move_takes_what_its_slowest_joint_takes():

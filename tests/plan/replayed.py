@@ -1,0 +1,59 @@
+"""A plan driven in MuJoCo, another engine than the one it was planned with."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.arm import Arm
+from handeye_tri.config import Cell
+from handeye_tri.plan.sequence import travel_time
+from handeye_tri.records import Plan
+from handeye_tri.simulate.compile import compile_cell
+
+Floats = NDArray[np.float64]
+
+
+def way_points(plan: Plan, arm: Arm) -> Floats:
+    """Joints that are passed from home on, stations and what lies between, (n, q)."""
+    ways = [
+        np.concatenate([via, station.joints[None]])
+        for station, via in zip(plan.stations, plan.via, strict=True)
+    ]
+    return np.concatenate([arm.home[None], *ways])
+
+
+def driven(start: Floats, end: Floats, speed: Floats, ramp: float) -> Floats:
+    """Joints every millisecond of a move from rest to rest, shape (n, q).
+
+    All joints speed up evenly, travel and slow down together.
+    """
+    seconds = float(travel_time(start, end, speed, ramp))
+    if seconds == 0:
+        return start[None]
+    ramp = min(ramp, seconds / 2)
+    time = np.append(np.arange(0, seconds, 1e-3), seconds)
+    rest = np.minimum(time, seconds - time)
+    slow = np.where(rest < ramp, rest**2 / (2 * ramp), rest - ramp / 2)
+    part = slow / (seconds - ramp)
+    part = np.where(time < seconds / 2, part, 1 - part)
+    return np.asarray(start + part[:, None] * (end - start))
+
+
+def contacts(cell: Cell, model_path: Path, arm: Arm, plan: Plan) -> tuple[int, int]:
+    """Milliseconds of a plan at which solids touch, and all of them."""
+    model, _ = compile_cell(cell, model_path)
+    data = mujoco.MjData(model)
+    touching = steps = 0
+    for start, end in pairwise(way_points(plan, arm)):
+        for joints in driven(start, end, arm.speed, cell.arm.acceleration_time_s):
+            data.qpos[:] = joints
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            touching += int(data.ncon > 0 and data.contact.dist.min() <= 0)
+            steps += 1
+    return touching, steps
