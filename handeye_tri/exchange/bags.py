@@ -16,9 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.errors import HandEyeError, InputError, StorageError
+from handeye_tri.exchange.bag_check import (
+    bound_chunks,
+    check_mcap,
+    refuse_compressed,
+)
 from handeye_tri.exchange.capture import MAX_POSES, ImageStream, PoseStream
 from handeye_tri.exchange.mcap_bag import SESSION_TOPIC, import_ros
-from handeye_tri.exchange.mcap_check import check_mcap
 from handeye_tri.exchange.tf_tree import Frames
 from handeye_tri.records import Floats, RobotDirection
 from handeye_tri.se3 import rotation_from_quaternion_wxyz, se3_inverse
@@ -75,6 +79,8 @@ class BagFile:
         import_ros()
         self.path = path
         self._ros1 = path.suffix == ".bag"
+        if path.is_dir():
+            refuse_compressed(path)
         files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
         for file in files:
             if file.suffix == ".mcap":
@@ -92,6 +98,8 @@ class BagFile:
         try:
             kind = rosbag1.Reader if self._ros1 else rosbag2.Reader
             with kind(self.path) as reader:
+                if self._ros1:
+                    bound_chunks(reader)
                 yield reader
         except HandEyeError:
             raise

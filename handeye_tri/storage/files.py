@@ -143,13 +143,21 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Read named arrays; nothing in the file is executed.
 
     Raises:
-        StorageError: missing, damaged, or an array is absent.
+        StorageError: missing, damaged, too large, or an array is absent.
     """
     data = read_bytes(path)
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            unpacked = sum(entry.file_size for entry in archive.zip.infolist())
+            if unpacked > _MAX_BYTES:
+                raise StorageError(
+                    f"{path}: this unpacks to {unpacked} bytes, more than the "
+                    f"{_MAX_BYTES} allowed; it cannot be one of our files"
+                )
             absent = [name for name in names if name not in archive.files]
             arrays = {name: archive[name] for name in names if name not in absent}
+    except StorageError:
+        raise
     except Exception as error:
         # zipfile, zlib and numpy raise a dozen types for a damaged archive.
         raise StorageError(
