@@ -24,6 +24,8 @@ _START_DAMPING = 1e-4
 _MAX_DAMPING = 1e12
 # (step / sigma)^2 of the last step taken; the one after would be its square.
 RELATIVE_TOLERANCE = 1e-9
+# The most that glibc takes as a threshold is 32 MiB, its own header included.
+_KEPT_BYTES = 32_000_000
 # Minima whose costs differ by a smaller part than this are one minimum.
 _SAME_COST = 1e-3
 
@@ -223,6 +225,7 @@ def minimise(
     Returns:
         The minimum; None where the start cannot be evaluated.
     """
+    _keep_pages()
     # Many products of small matrices: threads cost more than they bring.
     with one_thread():
         return _minimise(
@@ -249,6 +252,16 @@ def one_thread() -> AbstractContextManager[object]:
 def _blas() -> ThreadpoolController:
     """The libraries behind numpy, found once."""
     return ThreadpoolController().select(user_api="blas")
+
+
+@cache
+def _keep_pages() -> None:
+    """Let the allocator keep the pages of freed arrays, up to 32 MB each.
+
+    Fresh pages cost as much as what is computed in them. glibc gives arrays back to the
+    system unless it has seen a larger one freed (mallopt(3), M_MMAP_THRESHOLD).
+    """
+    np.empty(_KEPT_BYTES, dtype=np.uint8)
 
 
 def _minimise(
@@ -287,7 +300,7 @@ def _minimise(
             last = gain * (gain / before)
         negligible = last <= max(tolerance * cost / freedom, floor)
         if negligible and damping < 1.0 and not take_last:
-            converged = True
+            iteration, converged = iteration - 1, True
             break
         if (
             known is not None
