@@ -8,6 +8,7 @@ Source of the description: Zhao, Liu and Zhang 2008, Sec. II-B
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 from typing import Literal, get_args
 
 import numpy as np
@@ -42,6 +43,10 @@ class TriangleRig:
 
     def __post_init__(self) -> None:
         """Raise InputError unless this is a proper triangle."""
+        for name in ("side_ab", "side_ac", "angle"):
+            value = getattr(self, name)
+            if not isinstance(value, Real):
+                raise InputError(f"{name} must be a number, got {value!r}")
         for name in ("side_ab", "side_ac"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
@@ -64,9 +69,15 @@ class TriangleRig:
         """Triangle through measured A, B, C, shape (3, 3) or (3, 2), metres.
 
         Raises:
-            InputError: wrong shape, NaN, or the points are nearly collinear.
+            InputError: no numbers, wrong shape, NaN, or the points are nearly
+                collinear.
         """
-        p = np.asarray(points, dtype=float)
+        try:
+            p = np.asarray(points, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"A, B and C must be real numbers, got {points!r}"
+            ) from None
         if p.shape not in ((3, 3), (3, 2)):
             raise InputError(
                 f"A, B and C are points of shape (3, 3) or (3, 2), got {p.shape}"

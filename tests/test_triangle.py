@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -108,6 +110,9 @@ def test_edge_half_turn_keeps_the_edge_and_mirrors_the_third(axis: str) -> None:
         ((0.0, 0.1, 1.0), "side_ab must be a positive length, got 0.0 m"),
         ((0.1, np.nan, 1.0), "side_ac must be a positive length, got nan m"),
         ((0.1, np.inf, 1.0), "side_ac"),
+        ((-0.1, 0.1, 1.0), "side_ab must be a positive length, got -0.1 m"),
+        (("0.1", 0.1, 1.0), "side_ab must be a number, got '0.1'"),
+        ((0.1, 0.1, None), "angle must be a number, got None"),
         ((0.1, 0.1, 65.0), "between 0 and pi radians, got 65.0; degrees must be"),
         ((0.1, 0.1, 0.0), "between 0 and pi"),
         ((0.1, 0.1, np.nan), "between 0 and pi"),
@@ -116,7 +121,7 @@ def test_edge_half_turn_keeps_the_edge_and_mirrors_the_third(axis: str) -> None:
         ((0.001, 0.5, 1.0), "nearly collinear"),
     ],
 )
-def test_what_is_no_triangle(values: tuple[float, ...], message: str) -> None:
+def test_what_is_no_triangle(values: tuple[Any, ...], message: str) -> None:
     with pytest.raises(InputError, match=message):
         TriangleRig(*values)
 
@@ -130,9 +135,10 @@ def test_what_is_no_triangle(values: tuple[float, ...], message: str) -> None:
         ([[0, 0], [1, 0], [2, 0.01]], "nearly collinear"),
         ([[0, 0], [1, 0]], r"shape \(3, 3\) or \(3, 2\), got \(2, 2\)"),
         ([[0, 0], [np.nan, 0], [1, 1]], "positive length, got nan"),
+        ([["a", 0], [1, 0], [1, 1]], "A, B and C must be real numbers, got"),
     ],
 )
-def test_points_that_are_no_triangle(points: list[list[float]], message: str) -> None:
+def test_points_that_are_no_triangle(points: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
         TriangleRig.from_points(points)
 

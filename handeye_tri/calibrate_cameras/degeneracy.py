@@ -166,7 +166,9 @@ def plane_spread_deg(normals: Floats) -> float:
     return float(np.degrees(np.arccos(min(cosine, 1.0))))
 
 
-def check_planes(homographies: Homographies, noise_known: bool) -> None:
+def check_planes(
+    data: HalfTurnData, homographies: Homographies, noise_known: bool
+) -> None:
     """Refuse planes that cannot be told from parallel ones (Proposition 1).
 
     The vanishing lines of parallel planes are equal, whatever K is. If their scatter
@@ -175,12 +177,14 @@ def check_planes(homographies: Homographies, noise_known: bool) -> None:
     undetermined.
 
     Args:
+        data: The half-turns.
         homographies: One per half-turn.
         noise_known: Whether the covariances are absolute; otherwise they are scaled
             by the homographies' own chi2 / dof.
 
     Raises:
-        DegenerateMotionError: says the spread and the tilt, in degrees.
+        DegenerateMotionError: says the spread and the tilt, in degrees, and how large
+            the triangle is in the image.
     """
     line, covariance = vanishing_lines(homographies)
     # Normals as a nominal camera sees them: K is not known yet.
@@ -204,6 +208,15 @@ def check_planes(homographies: Homographies, noise_known: bool) -> None:
     if not explained and spread >= _MIN_PLANE_SPREAD_DEG:
         return
     tilt = float(np.degrees(np.arccos(normals[:, 2].clip(-1.0, 1.0))).max())
+    if explained and spread >= _LOW_SPREAD_DEG:
+        raise DegenerateMotionError(
+            f"the triangle's planes cannot be told from parallel ones in all "
+            f"{len(line)} half-turns: the spread of {spread:.2f} degrees is no more "
+            f"than noise, chi2 {chi2:.1f} of {limit:.1f}, because the triangle's mean "
+            f"side is only {np.median(_side_px(data)):.0f} px; come nearer, use a "
+            "larger triangle, or average images, and tilt it by at least 20 degrees "
+            "between half-turns"
+        )
     facing = " (all of them face the camera: fronto-parallel)" if tilt < 10 else ""
     scatter = (
         f"its scatter is no more than noise, chi2 {chi2:.1f} of {limit:.1f}"

@@ -34,7 +34,7 @@ from handeye_tri.calibrate_cameras.general_motion_views import (
     Views,
     epipolar_noise,
 )
-from handeye_tri.calibrate_cameras.half_turns import read_sigma
+from handeye_tri.calibrate_cameras.half_turns import check_triangle, read_sigma
 from handeye_tri.calibrate_cameras.options import lens_choice
 from handeye_tri.camera import (
     LENS_COEFFICIENTS,
@@ -104,6 +104,7 @@ def calibrate_cameras_general(
         ConvergenceError: no start led to cameras that explain the images as well as
             their epipolar geometry says that they can be explained.
     """
+    check_triangle(triangle)
     lens_model, lens = lens_choice(distortion)
     wanted = [LENS_COEFFICIENTS[lens_model][index] for index in lens]
     observed = read_points(points)

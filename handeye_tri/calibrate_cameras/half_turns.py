@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 # Markers nearer to each other than this cannot have been told apart, and a marker
 # off the axis that moved less has not been turned; pixels.
 _MIN_DISTANCE = 0.5
+# A triangle whose image is less high than this has no homography: rounding only.
+_MIN_HEIGHT = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +81,19 @@ class HalfTurnData:
         return result
 
 
+def check_triangle(triangle: object) -> None:
+    """Refuse what is no triangle, as lengths by themselves.
+
+    Raises:
+        InputError: says what was given and what is needed.
+    """
+    if not isinstance(triangle, TriangleRig):
+        raise InputError(
+            "triangle must be a TriangleRig(side_ab, side_ac, angle), in metres and "
+            f"radians; got {triangle!r}"
+        )
+
+
 def read_half_turns(
     before: ArrayLike,
     after: ArrayLike,
@@ -106,9 +121,11 @@ def read_half_turns(
         The half-turns in which all six points are finite; their indices.
 
     Raises:
-        InputError: shapes, names, weights or pixels cannot be used.
-        DegenerateMotionError: markers coincide, or a marker that should move stays.
+        InputError: triangle, shapes, names, weights or pixels cannot be used.
+        DegenerateMotionError: markers coincide or are in line, or a marker that should
+            move stays.
     """
+    check_triangle(triangle)
     pixels = _pixels(before, after)
     n = len(pixels)
     axes = read_axes(axis, n)
@@ -264,6 +281,19 @@ def _faults(
                 f"{('before', 'after')[j]} half-turn {used[i]} are "
                 f"{apart[i, j, k]:.3f} px apart in the image: one of them was found "
                 "twice, or the triangle is seen edge-on; drop this half-turn"
+            ),
+        )
+    ab, ac = (pixels[:, :, k] - pixels[:, :, 0] for k in (1, 2))
+    twice_area = np.abs(ab[..., 0] * ac[..., 1] - ab[..., 1] * ac[..., 0])
+    with np.errstate(invalid="ignore"):
+        height = twice_area / apart.max(axis=-1)
+    for i, j in np.argwhere(height < _MIN_HEIGHT):
+        yield (
+            used[i],
+            DegenerateMotionError(
+                f"markers A, B and C {('before', 'after')[j]} half-turn {used[i]} are "
+                f"in line to within {height[i, j]:.2g} px: the triangle is seen "
+                "edge-on, or a marker was taken for another; drop this half-turn"
             ),
         )
     moved = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=-1)

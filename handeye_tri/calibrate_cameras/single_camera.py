@@ -224,7 +224,7 @@ def calibrate_camera(
     check_turns(data, homographies.residual_px, lens_ahead=bool(lens))
     if len(choice.names) > 2:
         # One plane gives two constraints, and that is enough for two intrinsics.
-        check_planes(homographies, noise_known)
+        check_planes(data, homographies, noise_known)
 
     first: ClosedForm | None = None
     try:

@@ -17,7 +17,7 @@ from handeye_tri.calibrate_cameras.degeneracy import (
     check_count,
     least_noise,
 )
-from handeye_tri.calibrate_cameras.half_turns import read_axes
+from handeye_tri.calibrate_cameras.half_turns import check_triangle, read_axes
 from handeye_tri.calibrate_cameras.options import lens_choice, o_choice
 from handeye_tri.calibrate_cameras.trial_centre import average_trials_over_centre
 from handeye_tri.calibrate_cameras.trial_equations import inverses
@@ -33,6 +33,7 @@ from handeye_tri.calibrate_cameras.trial_starts import (
 )
 from handeye_tri.camera import INTRINSIC_NAMES, LENS_COEFFICIENTS, LensModel
 from handeye_tri.errors import InputError
+from handeye_tri.records import numeric
 from handeye_tri.triangle import Axis, TriangleRig
 
 Floats = NDArray[np.float64]
@@ -132,6 +133,7 @@ def calibrate_trials(
         DegenerateMotionError: n half-turns of this triangle are too few for the
             unknowns, or turn about an edge with a right angle at one of its ends.
     """
+    check_triangle(triangle)
     pixels, complete = _read(before, after)
     t, n = pixels.shape[:2]
     axes = read_axes(axis, n)
@@ -206,7 +208,7 @@ def _read(before: ArrayLike, after: ArrayLike) -> tuple[Floats, Bools]:
     """Pixels (t, n, 6, 2), 0 in half-turns that are not complete; which are (t, n)."""
     both = []
     for name, value in (("before", before), ("after", after)):
-        array = np.asarray(value, dtype=float)
+        array = numeric(name, value)
         if array.ndim != 4 or array.shape[2:] != (3, 2):
             raise InputError(
                 f"{name} must have shape (t, n, 3, 2): trial, half-turn, marker A B C, "
@@ -219,7 +221,7 @@ def _read(before: ArrayLike, after: ArrayLike) -> tuple[Floats, Bools]:
             f"{both[0].shape} and {both[1].shape}"
         )
     pixels = np.concatenate(both, axis=2)
-    complete: Bools = np.isfinite(pixels).all(axis=(2, 3))
+    complete = np.asarray(np.isfinite(pixels).all(axis=(2, 3)))
     if not complete.all():
         pixels[~complete] = 0.0
     return pixels, complete

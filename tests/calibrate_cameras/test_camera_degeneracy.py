@@ -227,6 +227,10 @@ def coincide(before, after):
     before[2, 1] = before[2, 0]
 
 
+def edge_on(before, after):
+    before[1, 2] = 0.5 * (before[1, 0] + before[1, 1])
+
+
 def unturned(before, after):
     after[1] = before[1]
 
@@ -237,6 +241,7 @@ def unturned(before, after):
         (nothing_found, InputError, "none of the 5 half-turns"),
         (outside, InputError, r"marker C after half-turn 3 lies at \(1030.0, 20.0\)"),
         (coincide, DegenerateMotionError, "markers A and B before half-turn 2"),
+        (edge_on, DegenerateMotionError, "A, B and C before half-turn 1 are in line"),
         (unturned, DegenerateMotionError, "half-turn 1 about 'normal' moved"),
         (
             lambda b, a: {"before": b[0]},
@@ -316,3 +321,21 @@ def test_wrong_image_size_is_refused() -> None:
         calibrate_camera(scene.before, scene.after, TRIANGLE, image_size=(100, 80))
     with pytest.raises(InputError, match="image_size must be"):
         calibrate_camera(scene.before, scene.after, TRIANGLE, image_size=(0, 80))
+
+
+@pytest.mark.parametrize("triangle", [None, (0.13, 0.12, 1.0)])
+def test_what_is_no_triangle_is_named(triangle) -> None:
+    scene = make_scene(np.random.default_rng(17), 5)
+    with pytest.raises(InputError, match=r"triangle must be a TriangleRig.*got "):
+        calibrate_camera(scene.before, scene.after, triangle, image_size=IMAGE_SIZE)
+
+
+def test_a_target_too_small_for_the_noise_is_said_to_be_that() -> None:
+    small = TriangleRig(0.01, 0.01, 1.0)
+    rng = np.random.default_rng(18)
+    scene = make_scene(rng, 8, triangle=small, foot=(0.004, 0.003))
+    with pytest.raises(
+        DegenerateMotionError,
+        match=r"planes cannot be told from parallel.*side is only 1\d px; come nearer",
+    ):
+        calibrate(scene, *scene.noisy(rng, 0.3), sigma_px=0.3)
