@@ -162,6 +162,49 @@ def test_a_four_axis_robot_leaves_one_shift_open_and_takes_a_measured_one(seed):
     assert after < 1.1 * before
 
 
+def five_axes(seed, yaws=1.0, rolls=1.0, n=25):
+    """A 5-axis arm: its tool stays in the upright plane through the base's axis."""
+    rng = np.random.default_rng([seed, 5])
+    x, z = random_poses(rng, 2, 0.15)
+    yaw, pitch, roll, out = np.zeros((4, n, 6))
+    yaw[:, 5] = yaws * rng.uniform(-0.7, 0.7, n)
+    out[:, 0], out[:, 2] = rng.uniform((0.3, 0.1), (0.6, 0.5), (n, 2)).T
+    pitch[:, 4] = rng.uniform(0.6, 2.2, n)
+    roll[:, 5] = rolls * rng.uniform(-1.5, 1.5, n)
+    a = se3_exp(yaw) @ se3_exp(out) @ se3_exp(pitch) @ se3_exp(roll)
+    camera_from_target = se3_inverse(z) @ a @ x
+    shift = np.eye(4)
+    shift[2, 3] = 2.0
+    camera_from_target, z = shift @ camera_from_target, z @ se3_inverse(shift)
+    return *noisy(rng, a, camera_from_target, NOISE), x
+
+
+@pytest.mark.parametrize(("yaws", "rolls"), [(1, 1), (1, 0), (0, 1)])
+def test_a_five_axis_robot_that_uses_two_of_its_turns_leaves_nothing_open(yaws, rolls):
+    errors = []
+    for seed in range(6):
+        robot, observed, x = five_axes(seed, yaws, rolls)
+        found = solve_pose_pairs(pairs_of(robot, observed, "eye_to_hand"))
+        assert found.undetermined == ()
+        error = (found.x.inverse() @ SE3(x)).log()
+        covariance = found.covariance.matrix[:6, :6]
+        errors.append(error @ np.linalg.solve(covariance, error) / 6)
+    assert 0.4 < np.mean(errors) < 2.0
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_five_axis_robot_that_only_pitches_leaves_one_shift_open(seed):
+    robot, observed, x = five_axes(seed, yaws=0, rolls=0)
+    pairs = pairs_of(robot, observed, "eye_to_hand")
+    (one,) = solve_pose_pairs(pairs).undetermined
+    assert one.kind == "shift"
+    np.testing.assert_allclose(one.axis_in_flange, (0, 1, 0), atol=2e-3)
+    np.testing.assert_allclose(one.axis_in_base, (0, 1, 0), atol=2e-3)
+    measured = solve_pose_pairs(pairs, shift_along_axis=float(x[1, 3]))
+    assert measured.undetermined == ()
+    np.testing.assert_allclose(measured.x.translation, x[:3, 3], atol=5e-3)
+
+
 def test_one_turning_joint_leaves_a_turn_and_a_shift_open():
     robot, observed, *_ = scara(0, with_shifts=False)
     found = solve_pose_pairs(pairs_of(robot, observed, "eye_to_hand"))
