@@ -20,6 +20,8 @@ _START = 0.001
 # What holds a marker may hide its outline where it lies less than this part of the
 # radius before the outline's plane: 1 % of the radius is covered there.
 _HOLDER_DEPTH = 0.15
+# A mesh thinner than this in some direction is a sheet, metres.
+_THIN = 1e-5
 # The side of a cone near its marker, as triangles between two circles.
 _SEGMENTS = 24
 _ANGLES = 2 * np.pi * np.arange(_SEGMENTS) / _SEGMENTS
@@ -50,13 +52,25 @@ def coal_shape(geometry: Geometry) -> coal.CollisionGeometry:
         case "plane":
             return coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
         case "mesh":
+            vertices = _thickened(geometry.vertices)
             mesh = coal.BVHModelOBBRSS()
-            mesh.beginModel(len(geometry.faces), len(geometry.vertices))
-            mesh.addVertices(geometry.vertices)
+            mesh.beginModel(len(geometry.faces), len(vertices))
+            mesh.addVertices(vertices)
             mesh.addTriangles(geometry.faces)
             mesh.endModel()
             mesh.buildConvexHull(True, "Qt")
             return mesh.convex
+
+
+def _thickened(vertices: Floats) -> Floats:
+    """Vertices (n, 3), a flat sheet's or a line's doubled: coal's hull needs a body."""
+    centred = vertices - vertices.mean(axis=0)
+    _, extent, directions = np.linalg.svd(centred, full_matrices=len(vertices) < 3)
+    extent = np.append(extent, np.zeros(3 - len(extent)))
+    for direction in directions[extent < _THIN]:
+        step = _THIN * direction
+        vertices = np.concatenate([vertices - step, vertices + step])
+    return vertices
 
 
 def bounding_radius(geometry: Geometry) -> float:

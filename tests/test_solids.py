@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,6 +67,24 @@ def test_a_mesh_is_its_convex_hull():
     for over, hit in ((1e-4, False), (-1e-4, True)):
         assert touches(solid, (0.1 / np.sqrt(3) + 0.01 + over) * toward) is hit
     assert touches(solid, (0, 0, 0))
+
+
+@pytest.mark.parametrize("corners", [4, 3, 2, 1])
+def test_a_sheet_and_a_line_are_solids_too(corners):
+    """A label in a model's drawing has no thickness; coal's hull needs one."""
+    square = np.array([[0.1, 0.1, 0], [-0.1, -0.1, 0], [0.1, -0.1, 0], [-0.1, 0.1, 0]])
+    turn = so3_exp([0.3, -0.4, 0.5])
+    shape = coal_shape(
+        replace(
+            geometry("mesh", vertices=TETRAHEDRON),
+            vertices=square[:corners] @ turn.T,
+            faces=np.zeros((1, 3), dtype=np.int64),
+        )
+    )
+    for corner in square[:corners]:
+        assert touches(shape, turn @ (corner + [0, 0, 0.0099]))
+        assert not touches(shape, turn @ (corner + [0, 0, 0.0101]))
+    assert touches(shape, np.zeros(3)) == (corners > 1)
 
 
 def test_a_plane_is_solid_below_it():

@@ -24,7 +24,6 @@ _STARTS = 9
 # The sphere to see whole is larger than the marker by this factor: blur and the
 # detector's window reach beyond the outline.
 SIGHT_MARGIN = 1.15
-_BY_RIG = "occlusion by the rig"
 # Two flange poses are one if they differ by less (m and rad).
 _SAME_POSE = 1e-9
 
@@ -62,11 +61,27 @@ class Candidate:
     seen: Flags
 
 
+@dataclass(frozen=True, slots=True)
+class _Forbidden:
+    """Why solids forbid joints.
+
+    Attributes:
+        check: Its name.
+        what: What solids do, in words.
+        by_rig: Whether the rig does it by itself.
+    """
+
+    check: str
+    what: str
+    by_rig: bool = False
+
+
 class CandidateSearch:
     """Draws poses and keeps those that pass; counts the others by check.
 
     Attributes:
         rejected: Rejected poses by the check that rejected them.
+        solids: What solids did that rejected one, in words; how often.
         drawn: Poses drawn.
     """
 
@@ -76,6 +91,7 @@ class CandidateSearch:
         arm: Arm,
         rng: np.random.Generator,
         rejected: Counter[str] | None = None,
+        solids: Counter[str] | None = None,
     ) -> None:
         """Start a search.
 
@@ -84,12 +100,14 @@ class CandidateSearch:
             arm: The robot in its cell.
             rng: What poses are drawn from.
             rejected: Counts on from there.
+            solids: Likewise.
         """
         self._view = view
         self._arm = arm
         self._rng = rng
         self._anchor = arm.home
         self.rejected: Counter[str] = Counter() if rejected is None else rejected
+        self.solids: Counter[str] = Counter() if solids is None else solids
         self.drawn = 0
 
     def find(
@@ -217,24 +235,26 @@ class CandidateSearch:
         """
         gaps = np.linalg.norm(prospect.joints[:, 0] - self._anchor, axis=1)
         found: list[Candidate] = []
-        reasons: list[str] = []
+        why: list[_Forbidden] = []
         for k in np.argsort(gaps, kind="stable"):
             joints = prospect.joints[k]
-            seen, reason = self._judged(joints, prospect.seen)
-            if reason is None:
-                found.append(self._candidate(prospect, joints, seen))
-                if len(found) == most:
+            judged = self._judged(joints, prospect.seen)
+            if isinstance(judged, _Forbidden):
+                why.append(judged)
+                if judged.by_rig:
+                    # The rig hides its own marker: so it does in every solution.
                     break
             else:
-                reasons.append("occlusion" if reason == _BY_RIG else reason)
-                if reason == _BY_RIG:
-                    # The rig hides its own marker: so it does in every solution.
+                found.append(self._candidate(prospect, joints, judged))
+                if len(found) == most:
                     break
         if found:
             self._anchor = found[0].joints[-1]
         else:
             # The solution that came farthest speaks for the pose.
-            self.rejected[max(reasons, key=("collision", "occlusion").index)] += 1
+            last = max(why, key=lambda one: one.check == "occlusion")
+            self.rejected[last.check] += 1
+            self.solids[last.what] += 1
         return found
 
     def _candidate(self, prospect: Prospect, joints: Floats, seen: Flags) -> Candidate:
@@ -242,20 +262,24 @@ class CandidateSearch:
         normal = self._view.normals(world @ prospect.base_from_flange[:1])[0]
         return Candidate(joints, self._arm.forward(joints), normal, seen)
 
-    def _judged(self, joints: Floats, seen: Flags) -> tuple[Flags, str | None]:
-        """Cameras left with a free sight, and the check that joints (s, q) fail."""
+    def _judged(self, joints: Floats, seen: Flags) -> Flags | _Forbidden:
+        """Cameras left with a free sight, or what forbids joints (s, q)."""
         arm, view = self._arm, self._view
-        if any(arm.collision(q) is not None for q in joints):
-            return seen, "collision"
-        free, reason = seen.copy(), "occlusion"
+        for q in joints:
+            hit = arm.collision(q)
+            if hit is not None:
+                return _Forbidden("collision", f"{hit[0]} touches {hit[1]}")
+        free = seen.copy()
         for i in np.flatnonzero(seen):
             blocker = self._blocker(joints, view.world_from_camera[i, :3, 3])
-            if blocker is not None:
-                free[i] = False
-                reason = _BY_RIG if blocker in arm.on_flange else "occlusion"
+            if blocker is None:
+                continue
+            free[i] = False
             if free.sum() < view.required:
-                return free, reason
-        return free, None
+                name = view.cell.cameras[i].name
+                what = f"{blocker} hides a marker from camera {name}"
+                return _Forbidden("occlusion", what, blocker in arm.on_flange)
+        return free
 
     def _blocker(self, joints: Floats, camera: Floats) -> str | None:
         """Name of a solid that hides a marker from a camera, or None."""

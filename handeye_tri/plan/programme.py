@@ -168,8 +168,9 @@ class _Planner:
         self.progress = progress
         self.done = -1
         self.rejected: Counter[str] = Counter()
+        self.solids: Counter[str] = Counter()
         self.route = RoutePlanner(
-            arm, cell.arm.acceleration_time_s, seed, self.rejected
+            arm, cell.arm.acceleration_time_s, seed, self.rejected, self.solids
         )
 
     def _done(self, done: int) -> None:
@@ -178,7 +179,12 @@ class _Planner:
         self.done = max(done, self.done)
 
     def plan(self) -> Plan:
-        """Search, choose, order, and add the evaluation stations."""
+        """Search, choose, and order."""
+        touching = self.arm.collision(self.visited.joints)
+        if touching is not None:
+            self.rejected["path"] += 1
+            self.solids[f"{touching[0]} touches {touching[1]}"] += 1
+            raise self._no_plan(1, "the arm cannot leave where it stands", "path")
         search = self._search(0)
         # Half of the work is in what comes after the pool.
         pool = search.prospects(self.pool_size, progress=lambda n: self._done(n // 2))
@@ -194,7 +200,7 @@ class _Planner:
 
     def _search(self, stream: int) -> CandidateSearch:
         rng = np.random.default_rng([self.seed, stream])
-        return CandidateSearch(self.view, self.arm, rng, self.rejected)
+        return CandidateSearch(self.view, self.arm, rng, self.rejected, self.solids)
 
     def _choose(
         self, pool: Sequence[Prospect], search: CandidateSearch
@@ -362,4 +368,4 @@ class _Planner:
         )
 
     def _no_plan(self, drawn: int, what: str, check: str | None = None) -> NoPlanError:
-        return no_plan(self.cell.name, self.rejected, drawn, what, check)
+        return no_plan(self.cell.name, self.rejected, drawn, what, check, self.solids)

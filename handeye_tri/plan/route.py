@@ -49,16 +49,23 @@ class RoutePlanner:
 
     Attributes:
         rejected: Counts straight ways that something stands in, as "path".
+        solids: What touched on them, in words; how often.
     """
 
     def __init__(
-        self, arm: Arm, acceleration_time: float, seed: int, rejected: Counter[str]
+        self,
+        arm: Arm,
+        acceleration_time: float,
+        seed: int,
+        rejected: Counter[str],
+        solids: Counter[str],
     ) -> None:
         """Store what moves cost."""
         self._arm = arm
         self._acceleration_time = acceleration_time
         self._seed = seed
         self.rejected = rejected
+        self.solids = solids
 
     def time(self, start: Floats, end: Floats) -> Floats:
         """Seconds of straight moves, shape (...), between joints (..., q)."""
@@ -87,7 +94,9 @@ class RoutePlanner:
         visits = Visits(
             ways, self.time(start, joints), self.time(joints[:, None], joints[None])
         )
-        moves = _Moves(self._arm, np.concatenate([joints, start[None]]), self._seed)
+        moves = _Moves(
+            self._arm, np.concatenate([joints, start[None]]), self._seed, self.solids
+        )
         order = shortest_order(visits, self._seed, _ROUNDS)
         for _ in range(_ORDERS):
             wanted = list(pairwise([_START, *order.options]))
@@ -155,9 +164,12 @@ class _Moves:
         via: Points to pass, by free move, shapes (p, q).
     """
 
-    def __init__(self, arm: Arm, joints: Floats, seed: int) -> None:
+    def __init__(
+        self, arm: Arm, joints: Floats, seed: int, solids: Counter[str]
+    ) -> None:
         self._arm = arm
         self._seed = seed
+        self._solids = solids
         self._blocked: set[tuple[int, int]] = set()
         self._hopeless: set[tuple[int, int]] = set()
         self.joints = joints
@@ -166,10 +178,12 @@ class _Moves:
     def free(self, a: int, b: int) -> bool:
         """Whether a move is known to be free, or is free where it is straight."""
         if (a, b) not in self.via and (a, b) not in self._blocked:
-            if self._arm.path_collision(self.joints[a], self.joints[b]) is None:
+            hit = self._arm.path_collision(self.joints[a], self.joints[b])
+            if hit is None:
                 self._keep(a, b, np.zeros((0, self.joints.shape[1])))
             else:
                 self._blocked |= {(a, b), (b, a)}
+                self._solids[f"{hit[0]} touches {hit[1]}"] += 1
         return (a, b) in self.via
 
     def lead_round(self, a: int, b: int) -> bool:

@@ -42,7 +42,7 @@ def test_a_way_leads_round_what_stands_between():
 
 def drive(arm, places, start):
     rejected = Counter()
-    return RoutePlanner(arm, 0.3, 1, rejected).drive(places, start), rejected
+    return RoutePlanner(arm, 0.3, 1, rejected, Counter()).drive(places, start), rejected
 
 
 def single(joints):
