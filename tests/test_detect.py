@@ -454,6 +454,59 @@ def test_rendered_views_of_planned_stations(name: str) -> None:
     assert 0.4 < squares.mean() < 2.5
 
 
+TRIANGLE = np.array([[0.0, 0.0], [0.13, 0.0], [0.05, 0.11]])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_triangle_tells_a_marker_from_a_second_thing_of_its_looks(
+    seed: int,
+) -> None:
+    """A triangle aslant by 40 degrees, and a second red disc of a ball's size."""
+    rng = np.random.default_rng([31, seed])
+    turn = rng.uniform(0, 2 * np.pi)
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    scale = 900.0
+    shape = rotation @ np.diag([1.0, np.cos(np.radians(40))]) @ rotation.T
+    centres = (TRIANGLE - TRIANGLE.mean(axis=0)) @ rotation.T @ shape * scale
+    centres += [160, 120]
+    canvas = Canvas(320, 240, 120)
+    for centre, colour in zip(centres, PURE, strict=True):
+        canvas.disc(255 * colour, centre, 0.008 * scale)
+    decoy = np.array([20.0, 20.0])
+    canvas.disc(255 * PURE[0], decoy, 0.008 * scale)
+    image = canvas.image(rng)
+    blind = detect_markers(image, BY_COLOUR)
+    assert blind.reasons[0] == "ambiguous"
+    known = MarkerSpec("colour", PURE, EQUAL, TRIANGLE)
+    found = detect_markers(image, known)
+    assert found.complete
+    assert np.abs(found.pixels - centres).max() < 0.1
+
+
+def test_a_lone_thing_too_far_from_the_others_is_not_taken() -> None:
+    """A is hidden; a red disc lies where A cannot be."""
+    canvas = Canvas(320, 240, 120)
+    for centre, colour in (((150, 200), PURE[1]), ((110, 150), PURE[2])):
+        canvas.disc(255 * colour, np.array(centre, dtype=float), 7.2)
+    canvas.disc(255 * PURE[0], np.array([300.0, 20.0]), 7.2)
+    image = canvas.image(np.random.default_rng(32))
+    found = detect_markers(image, MarkerSpec("colour", PURE, EQUAL, TRIANGLE))
+    assert [reason is None for reason in found.reasons] == [False, True, True]
+
+
+def test_flat_dots_seen_aslant_are_found() -> None:
+    rng = np.random.default_rng(33)
+    canvas = Canvas(320, 240, 230)
+    centres = place(rng)
+    for centre, radius in zip(centres, (9.0, 11.0, 13.8), strict=True):
+        # 0.5 the other way: 60 degrees.
+        canvas.disc((10, 10, 10), centre, radius, 0.55)
+    image = canvas.image(rng, noise=1.0, blur=0.5)
+    found = detect_markers(image, BY_RADIUS)
+    assert found.complete
+    assert np.abs(found.pixels - centres).max() < 0.15
+
+
 def test_the_sheet_shows_what_was_found_and_why_not() -> None:
     rng = np.random.default_rng(15)
     canvas = Canvas(320, 240, 120)

@@ -180,9 +180,34 @@ def _verb(name: str, text: str) -> None:
 
 
 _verb("simulate", "Execute the plan in the simulator and render every view.")
-_verb("detect", "Find the three markers in every image, with their covariance.")
 _verb("evaluate", "Compare the robot's track with the cameras', held out.")
 _verb("report", "Write the recording (replay.rrd) and report.html.")
+
+
+@commands.command(epilog=example("handeye-tri detect out --debug sheets"))
+@SESSION
+@click.option(
+    "--debug",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="FOLDER",
+    help="Write there, view by view, a picture of what was taken for what.",
+)
+@AGAIN
+def detect(session: Path, debug: Path | None, again: bool) -> None:
+    """Find the three markers in every image, with their covariance."""
+    from handeye_tri.storage import SessionFolder
+
+    finished = _work(SessionFolder.open(session), ("detect",), again=again)
+    if debug is not None:
+        from handeye_tri.pipeline.sheets import write_sheets
+
+        progress = StderrProgress()
+        progress.begin(1, 1, "sheets")
+        try:
+            count = write_sheets(finished, debug, progress.advance)
+        finally:
+            progress.close()
+        click.echo(f"wrote {count} sheets to {debug}")
 
 
 def _robot_errors(

@@ -108,7 +108,11 @@ def _measured(
         # Of a grey image only.
         excess = outlines.levels[good, None] - 255.0 * markers.colours.mean(axis=1)
     named, unclear = assign(
-        [spots[k].markers for k in good], outlines.radii[good], markers.radii, excess
+        [spots[k].markers for k in good],
+        outlines.centres[good],
+        outlines.longest[good],
+        markers,
+        excess,
     )
     why: list[Reason] = []
     for marker in range(3):

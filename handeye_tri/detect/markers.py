@@ -38,11 +38,14 @@ class MarkerSpec:
         identity: "colour" (RGB images) or "radius" (grey images).
         colours: Red, green, blue of A, B, C, 0-1, shape (3, 3).
         radii: Radii of A, B, C, metres, shape (3,).
+        points: Their centres in the triangle's plane, metres, shape (3, 2), by which
+            other things of their looks are told from them; None where not known.
     """
 
     identity: Identity
     colours: Floats
     radii: Floats
+    points: Floats | None = None
 
     def __post_init__(self) -> None:
         """Lock the arrays.
@@ -64,6 +67,9 @@ class MarkerSpec:
             raise InputError(
                 f"marker radii must be positive metres, got {radii.tolist()}"
             )
+        if self.points is not None:
+            points = locked("marker points", self.points, (3, 2))
+            object.__setattr__(self, "points", points)
         object.__setattr__(self, "colours", colours)
         object.__setattr__(self, "radii", radii)
         if self.identity == "colour":
@@ -108,6 +114,7 @@ class MarkerSpec:
             rig.identity,
             np.array(rig.marker_colours),
             1e-3 * np.array(rig.marker_radii_mm),
+            rig.triangle.points[:, :2],
         )
 
 

@@ -64,7 +64,8 @@ _MAX_UNEVEN = 0.08
 _MIN_USABLE = 0.5
 _MAX_HIDDEN = 0.12
 _MAX_ASTRAY = 0.2
-_MAX_OVAL = 0.35
+# Flat dots are seen by up to 60 degrees aslant.
+_MAX_OVAL = 0.6
 _MAX_MISFIT = 0.22
 _BORDER = 1.0
 _MAX_SCATTER_RATIO = 3.0
@@ -79,6 +80,8 @@ class Outlines:
         gain: Covariance of the centres for an edge of unit scatter, (m, 2, 2), px^2.
         scatter: Variance of the covers along the edge, shape (m,).
         radii: Mean radii, shape (m,), px.
+        longest: Semi-axes the long way, shape (m,), px: of a flat dot that is seen
+            aslant, what it would measure face on.
         levels: Levels inside, shape (m,).
         reasons: Why an outline is not usable, None where it is.
     """
@@ -87,6 +90,7 @@ class Outlines:
     gain: Floats
     scatter: Floats
     radii: Floats
+    longest: Floats
     levels: Floats
     reasons: tuple[Reason | None, ...]
 
@@ -142,6 +146,7 @@ def measure(
         gain,
         scatter,
         ellipses[:, 2] / (1 - flat) ** 0.25,
+        ellipses[:, 2] / np.sqrt(1 - np.sqrt(flat)),
         levels,
         tuple(reasons),
     )

@@ -20,6 +20,8 @@ STRIDES = (4, 2, 1)
 # A pixel has a marker's colour from this part of the full chroma on.
 _MIN_PART = 0.35
 _MIN_SAMPLES = 6
+# So many round spots of a hue are measured.
+_MOST_SPOTS = 12
 # Grey markers are flat spots: a step of more levels than this is an edge.
 _EDGE_LEVELS = 14.0
 # A corner's response is at least this part of the strongest one's.
@@ -45,7 +47,7 @@ class Candidate:
 
 
 def coloured_spots(image: Image, spec: MarkerSpec) -> list[Candidate]:
-    """Spots of each marker's hue, at most three a marker, largest first.
+    """Spots of each marker's hue, the largest round ones, or else the largest.
 
     Args:
         image: RGB, shape (h, w, 3).
@@ -84,7 +86,11 @@ def _spots_of(scores: Sequence[Image], marker: int, stride: int) -> list[Candida
     mask = (own > np.maximum(*others)).astype(np.uint8)
     _, _, stats, centroids = cv2.connectedComponentsWithStats(mask, connectivity=8)
     # Row 0 is what is not in the mask.
-    order = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA])[:3]
+    order = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA])
+    order = order[stats[order, cv2.CC_STAT_AREA] >= _MIN_SAMPLES]
+    round_ = order[_is_round(stats[order])][:_MOST_SPOTS]
+    # What is not round shows why there is no marker.
+    order = round_ if len(round_) else order[:3]
     return [
         Candidate(
             (marker,),
@@ -95,8 +101,17 @@ def _spots_of(scores: Sequence[Image], marker: int, stride: int) -> list[Candida
             stride * float(np.sqrt(stats[k, cv2.CC_STAT_AREA] / np.pi)),
         )
         for k in order
-        if stats[k, cv2.CC_STAT_AREA] >= _MIN_SAMPLES
     ]
+
+
+def _is_round(stats: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Which of connected parts, rows of OpenCV's statistics, may be an ellipse.
+
+    It fills pi / 4 of its box, less where it lies aslant or is small.
+    """
+    _, _, width, height, area = stats.T
+    longest, shortest = np.maximum(width, height), np.minimum(width, height)
+    return np.asarray((longest <= 2 * shortest + 1) & (area > 0.5 * width * height))
 
 
 def flat_spots(image: Image, shrink: int) -> list[Candidate]:
@@ -121,8 +136,8 @@ def flat_spots(image: Image, shrink: int) -> list[Candidate]:
     _, _, stats, centroids = cv2.connectedComponentsWithStats(flat, connectivity=4)
     _, _, width, height, area = stats[1:].T
     longest = np.maximum(width, height)
-    round_ = (longest <= 1.5 * np.minimum(width, height) + 1) & (longest >= 2)
-    round_ &= (area > 0.6 * width * height) & (longest < _MAX_PART * min(flat.shape))
+    round_ = _is_round(stats[1:]) & (longest >= 2)
+    round_ &= longest < _MAX_PART * min(flat.shape)
     middle = 0.5 * (shrink - 1)
     return [
         Candidate(

@@ -88,6 +88,22 @@ def test_the_recording_holds_the_numbers_of_the_evaluation(session):
     assert numbers["step_count"] == 4
 
 
+def test_detect_debug_writes_a_sheet_of_every_view(session, tmp_path):
+    done = command("detect", session, "--debug", tmp_path / "sheets")
+    assert done.returncode == 0, done.stderr
+    sheets = sorted(path.name for path in (tmp_path / "sheets").iterdir())
+    images = sorted(path.name for path in (session / "images").glob("*.png"))
+    assert sheets == images
+    assert f"wrote {len(images)} sheets" in done.stdout
+    sheet = read_image(tmp_path / "sheets" / sheets[0])
+    # The image with the three markers enlarged beside it.
+    assert sheet.shape == (768, 1024 + 256, 3)
+    (tmp_path / "file").write_text("")
+    done = command("detect", session, "--debug", tmp_path / "file" / "sheets")
+    assert done.returncode == 2
+    assert "cannot make this folder" in done.stderr
+
+
 def test_the_recording_opens_without_a_view_error(session, tmp_path):
     picture = tmp_path / "replay.png"
     done = command("replay", session, "--screenshot", picture)
