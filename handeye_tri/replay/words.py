@@ -134,8 +134,9 @@ def _legend(story: Story) -> str:
         f"out.{truth}\n\nImages: o where a marker is seen, + where calibration and "
         f"robot put it, the arrow from + to o {story.magnification_px} times too long. "
         f"{lines}\n\nIn space: arrows from where the robot says a marker is to where "
-        f"the cameras see it, {story.magnification} times too long.\n\nTimelines (below): "
-        "station; step, how the calibration got there; track, the held-out stations."
+        f"the cameras see it, {story.magnification} times too long.\n\nTimelines "
+        "(below): station; step, how the calibration got there; track, the held-out "
+        "stations."
     )
 
 

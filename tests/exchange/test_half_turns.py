@@ -97,6 +97,35 @@ def test_a_station_belongs_to_one_half_turn():
     assert found.others == ("1-2: station 1 already belongs to 0-1",)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_the_stations_of_a_half_turn_may_lie_anywhere(seed):
+    rng = np.random.default_rng([5, seed])
+    poses = programme(rng, [about(AXIS, FOOT)] * 11, noise=1e-4)
+    poses = np.concatenate([poses, se3_exp(rng.uniform(-0.8, 0.8, (6, 6)))])
+    order = rng.permutation(len(poses))
+    at = np.argsort(order)
+    expected = sorted(sorted((int(at[2 * k]), int(at[2 * k + 1]))) for k in range(11))
+    found = find_half_turns(poses[order], TOLERANCE)
+    assert [list(pair) for pair in pairs(found)] == expected
+    assert abs(found.axis @ AXIS) > np.cos(3e-4)
+
+
+def test_of_several_partners_the_nearest_in_order_is_taken():
+    start = se3_exp([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    turn = about(AXIS, FOOT)
+    elsewhere = se3_exp([0.3, -0.2, 0.1, -0.5, 0.2, 0.1])
+    poses = [start, start @ turn, elsewhere, start, start @ turn]
+    assert pairs(find_half_turns(np.array(poses), TOLERANCE)) == [(0, 1), (3, 4)]
+    poses = [start, elsewhere, start @ turn, elsewhere @ turn]
+    assert pairs(find_half_turns(np.array(poses), TOLERANCE)) == [(0, 2), (1, 3)]
+
+
+def test_many_stations_take_little_time():
+    rng = np.random.default_rng(6)
+    poses = programme(rng, [about(AXIS, FOOT)] * 500, noise=1e-4)
+    assert len(find_half_turns(poses, TOLERANCE).turns) == 500
+
+
 def test_without_any_there_are_none():
     rng = np.random.default_rng(4)
     poses = se3_exp(rng.uniform(-0.5, 0.5, (9, 6)))
