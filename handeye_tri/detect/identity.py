@@ -22,8 +22,8 @@ _MIN_MARGIN = 0.1
 # By how much the triangle's size may differ from what the markers' sizes say, as a
 # logarithm: perspective makes near markers larger and near sides longer.
 _MAX_MISMATCH = 0.2
-# The least cosine of the angle by which the triangle is seen aslant.
-_MIN_FACING = 0.25
+# The least cosine of the angle by which the triangle is seen aslant: 66 degrees.
+_MIN_FACING = 0.4
 
 
 def assign(
@@ -39,7 +39,7 @@ def assign(
     that the ratios of size in the image to radius agree within a few percent. They
     are the image's scale; in it the triangle, seen aslant, is as long as it is one
     way and shorter the other way (weak perspective). Of two markers, the distance is
-    at most that of the triangle.
+    at most that of the triangle, and not much shorter.
 
     Args:
         allowed: For each of m spots the markers that it may be.
@@ -102,13 +102,17 @@ def _mismatch(centres: Floats, points: Floats, scale: Floats) -> Floats:
         scale: Of the image by the markers' sizes, shape (w,), px per metre.
 
     Returns:
-        Shape (w,); infinite where the triangle would be seen from its edge.
+        Shape (w,); infinite where the triangle would be seen nearly from its edge.
     """
     sides = centres[:, 1:] - centres[:, :1]
     true = points[1:] - points[:1]
     if len(true) == 1:
         longest = np.linalg.norm(sides[:, 0], axis=1) / np.linalg.norm(true)
-        return np.asarray(np.maximum(np.log(longest / scale), 0.0))
+        size = np.log(longest / scale)
+        # A side that lies along the line of sight is shorter, but not by so much.
+        return np.asarray(
+            np.where(size > np.log(_MIN_FACING), np.maximum(size, 0.0), np.inf)
+        )
     sizes = np.linalg.svd(np.linalg.solve(true, sides), compute_uv=False)
     long, short = sizes[:, 0], sizes[:, 1]
     off = np.abs(np.log(np.maximum(long, 1e-9) / scale))

@@ -11,7 +11,7 @@ from handeye_tri.replay.steps import Slide
 from handeye_tri.replay.story import Story, worst_station
 from handeye_tri.triangle import VERTICES
 
-# rerun's names of the levels of a log.
+# rerun's names of the levels of a log, worst first.
 _LEVELS = {"error": "ERROR", "warning": "WARN", "note": "INFO"}
 
 
@@ -109,7 +109,8 @@ def _look_at(story: Story) -> str:
 
 def _findings(findings: Sequence[Mapping[str, Any]]) -> list[str]:
     lines: list[str] = []
-    for finding in findings:
+    order = list(_LEVELS)
+    for finding in sorted(findings, key=lambda one: order.index(one["severity"])):
         lines += [
             f"**{finding['code']}** {finding['cause']} ({finding['evidence']}). "
             f"Do: {finding['remedy']}.",

@@ -178,6 +178,7 @@ def test_the_verdict_names_station_gates_and_source():
         "gates": [{"verdict": "bad"}, {"verdict": "good"}, {"verdict": "not run"}],
         "findings": [
             {"code": "LOOP", "cause": "noise", "evidence": "1.9", "remedy": "look"}
+            | {"severity": "error"}
         ],
         "track": {
             **{key: 1.5 for key in ("mean_mm", "rms_mm", "max_mm")},

@@ -139,6 +139,20 @@ def test_without_a_pass_the_failure_leads_and_numbers_are_warned_of(outcome, und
     assert f'class="verdict {outcome.split()[0]}"' in html
 
 
+def test_findings_are_worst_first_and_say_where(undrawn):
+    told = {"cause": "c", "evidence": "e", "remedy": "r"}
+    findings = [
+        {**told, "code": "NOTED", "severity": "note"},
+        {**told, "code": "WRONG", "severity": "error", "stations": [4, 6]},
+        {**told, "code": "WARNED", "severity": "warning", "camera": "left"},
+    ]
+    text = text_of(page(changes={"findings": findings}))
+    assert text.index("WRONG c") < text.index("WARNED c") < text.index("NOTED c")
+    assert "(stations 4, 6)" in text
+    assert "(camera left)" in text
+    assert "worst first: WRONG, WARNED, NOTED" in text
+
+
 def test_every_estimated_quantity_is_there_with_its_sigma(html):
     text = text_of(html)
     for row in evaluation(finished())["result"]:
