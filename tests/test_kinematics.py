@@ -135,6 +135,32 @@ def test_inverse_reaches_reachable_targets(name, rng):
     assert np.abs(error).max() < 1e-9
 
 
+def test_a_short_slide_leaves_the_way_to_the_hinges(rng):
+    """Else the shortest step would drive it far beyond its range."""
+    chain = on_a_rail()
+    chain.lower[0], chain.upper[0] = -0.05, 0.05
+    start = chain.random(rng, 300)
+    target = chain.forward(chain.random(rng, 300))
+    q, norm = chain.descend(start, target, 40)
+    reached = norm < 1e-8
+    assert reached.mean() > 0.5
+    # Metres; as far as hinges turn it would be half a metre.
+    assert np.median(np.abs(q[reached, 0])) < 0.1
+
+
+def test_inverse_tries_longer_where_only_the_limits_are_in_the_way(rng):
+    """Narrow limits: most of what is reached from 12 starts is beyond them."""
+    chain = seven_joints()
+    chain.lower[:] = -1.2
+    chain.upper[:] = 1.2
+    target = chain.forward(chain.random(rng, 300))
+    solver = InverseKinematics(chain)
+    few = solver.solve(target, rng, starts=12, first=True)
+    assert np.mean([len(rows) > 0 for rows in few.joints]) > 0.98
+    every = solver.solve(target, rng, starts=12)
+    assert np.mean([len(rows) > 0 for rows in every.joints]) < 0.98
+
+
 def test_inverse_finds_all_branches_of_a_spherical_wrist(rng):
     """Elbow and wrist give four solutions here; the drawn one is among them."""
     chain = six_joints()

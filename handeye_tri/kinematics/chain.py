@@ -70,6 +70,16 @@ class SerialChain:
         """Weighs a turn against a shift: turns count in metres at this distance."""
         return 0.5 * self.reach
 
+    @cached_property
+    def strides(self) -> Floats:
+        """How far a joint goes for as much as a radian of the others, shape (q,).
+
+        A slide's range counts as a whole turn, else the shortest step would rather
+        leave it than turn a hinge.
+        """
+        lower, upper = self._range
+        return np.where(self.slides, (upper - lower) / (2 * np.pi), 1.0)
+
     def joint_frames(self, q: ArrayLike) -> tuple[Floats, Floats]:
         """Frames that move with each joint, in the base.
 
@@ -202,7 +212,8 @@ class SerialChain:
             normal = np.einsum("ajn,bjn->abn", jacobian, jacobian)
             damping = _DAMPING * np.einsum("an,an->n", residual, residual) + 1e-13
             normal[range(6), range(6)] += damping
-            q += np.einsum("ajn,an->jn", jacobian, solve_positive(normal, residual))
+            solved = solve_positive(normal, residual)
+            q += self.strides[:, None] * np.einsum("ajn,an->jn", jacobian, solved)
             # Sorting out before the step would copy all that it needs.
             if ended.any():
                 left = np.flatnonzero(~ended)
@@ -229,7 +240,7 @@ class SerialChain:
             result[a] = along[:, b] * arm[:, c] - along[:, c] * arm[:, b]
         result[3:] = self.lever * along.transpose(1, 0, 2)
         for i in np.flatnonzero(self.slides):
-            result[:3, i], result[3:, i] = along[i], 0.0
+            result[:3, i], result[3:, i] = self.strides[i] * along[i], 0.0
         return result
 
     @cached_property

@@ -24,8 +24,12 @@ _TABLE_SIZE = 800
 _FORESEEN = 8
 # Damping of that step, per squared lever.
 _FIRST_DAMPING = 1e-3
+# What leaving the limits costs there, squared, against going as far.
+_OUTSIDE = 100.0
 # Starts that are spent on a target before those that are left get more.
 _ROUNDS = (1, 3, 12)
+# What only solutions beyond the limits have reached by then gets so many times more.
+_MORE = 4
 # Solutions closer than this in every joint are one.
 _SAME = 1e-4
 
@@ -89,7 +93,8 @@ class InverseKinematics:
             rng: Draws every third start; the others are the nearest of a table.
             starts: How many starts a target gets.
             first: Stop at a target's first solution. Then the first starts are those
-                of the table's nearest that promise the shortest way.
+                of the table's nearest that promise the shortest way, and a target
+                that was reached beyond the limits alone gets more than ``starts``.
 
         Returns:
             Solutions by target.
@@ -99,9 +104,14 @@ class InverseKinematics:
         beyond = np.zeros(len(target), dtype=bool)
         left = np.arange(len(target))
         ahead = self._foreseen(target) if first else None
-        ends = [end for end in _ROUNDS if first and end < starts] + [starts]
+        ends = [starts]
+        if first:
+            ends = [*(end for end in _ROUNDS if end < starts), starts]
+            ends.append(min(_MORE * starts, _TABLE_SIZE))
         begin = 0
         for end in ends:
+            if end > starts:
+                left = left[beyond[left]]
             if len(left) == 0:
                 break
             if ahead is not None and end <= _FORESEEN:
@@ -142,6 +152,7 @@ class InverseKinematics:
         turned = jacobian.transpose(0, 2, 1)
         damping = _FIRST_DAMPING * chain.lever**2 * np.eye(6)
         back = turned @ np.linalg.inv(jacobian @ turned + damping)
+        back *= chain.strides[:, None]
         return _Table(
             np.ascontiguousarray(joints.T, dtype=np.float32),
             np.concatenate([-2.0 * features, square], axis=1, dtype=np.float32).T,
@@ -202,7 +213,7 @@ class InverseKinematics:
         limits = (one[:, None].astype(np.float32) for one in (chain.lower, chain.upper))
         outside = q - np.clip(q, *limits)
         length = np.einsum("jn,jn->n", step, step)
-        length += 10.0 * np.einsum("jn,jn->n", outside, outside)
+        length += _OUTSIDE * np.einsum("jn,jn->n", outside, outside)
         order = np.argsort(length.reshape(shape), axis=1)
         ordered = np.take_along_axis(q.T.reshape(*shape, -1), order[..., None], 1)
         return ordered.astype(float)
