@@ -7,6 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
+from listening import listening
 
 from handeye_tri.errors import (
     InputError,
@@ -81,6 +82,8 @@ def test_a_killed_process_loses_nothing(tmp_path, serial):
 
 
 def test_a_killed_dask_worker_loses_nothing(tmp_path, serial, cluster):
+    # Nobody outside this machine can give the workers something to run.
+    assert {address for address, _ in listening(os.getpid())} == {"127.0.0.1"}
     task = functools.partial(draw_and_kill_once, tmp_path)
     assert run(task, tmp_path / "draws.jsonl", dask=cluster) == serial
     assert (tmp_path / "killed").exists()

@@ -15,6 +15,7 @@ from finished_session import (
     photograph,
     world_from_body,
 )
+from listening import listening
 from PIL import Image
 
 from handeye_tri.errors import HandEyeError, InputError, MissingDependencyError
@@ -192,17 +193,11 @@ def test_the_served_page_answers_on_loopback_only(recording):
                 except OSError:
                     time.sleep(0.1)
             assert b"<html" in page.lower()
-            listening = subprocess.run(
-                ["cat", "/proc/net/tcp"], capture_output=True, text=True, check=True
-            ).stdout.split("\n")[1:]
-            ours = [
-                line.split()[1]
-                for line in listening
-                if line
-                and line.split()[1].endswith(f":{port:04X}")
-                and line.split()[3] == "0A"
-            ]
-            assert ours == [f"0100007F:{port:04X}"]
+            ours = listening(process.pid)
+            assert ("127.0.0.1", port) in ours
+            # The page's port and that of its data, and no other address.
+            assert {address for address, _ in ours} == {"127.0.0.1"}
+            assert len(ours) == 2
         finally:
             process.send_signal(signal.SIGINT)
             try:
