@@ -31,6 +31,9 @@ _EPSILON = float(np.finfo(float).eps)
 _WITHIN_95 = 1.614
 # A focal length that is known worse than this is not calibrated.
 _WORST_FOCAL = 0.01
+# One whose focal length its own half-turns leave so open cannot be begun with: in
+# simulations they begin to fail at 8 %.
+_WORST_START = 0.05
 # Half-turns drawn to find the best one to add.
 _DRAWN = 1500
 _PIXELS = ("fx", "fy", "skew", "cx", "cy")
@@ -73,6 +76,8 @@ def certify(
       ``sigma.base_from_<camera>.translation_mm`` and ``.rotation_deg``, and the same of
       ``flange_from_triangle``: predicted standard deviations (for motions: of the
       three axes together),
+    * ``alone.<camera>.fx_px``: predicted standard deviation of a camera's focal length
+      from its own half-turns, with which a calibration begins,
     * ``track_calibration_rms_mm``: the calibration's part of the predicted distance
       between reported and observed markers, over the workspace box,
     * ``track_predicted_rms_mm``: the same with the noise of a new view and of the
@@ -109,6 +114,10 @@ def certify(
     numbers |= _of_motion("flange_from_triangle", rig)
     if len(cell.cameras) > 1:
         numbers["sigma.baseline_mm"] = 1e3 * model.baseline_sigma(covariance)
+    whole = np.asarray(seen[turns].all(axis=1))
+    alone = model.focal_sigmas_alone(base_from_flange[turns], whole)
+    for camera, sigma in zip(cell.cameras, alone, strict=True):
+        numbers[f"alone.{camera.name}.fx_px"] = float(sigma)
     caused = float((model.workspace_cost * covariance.matrix).sum())
     numbers["track_calibration_rms_mm"] = float(1e3 * np.sqrt(caused))
     numbers["track_predicted_rms_mm"] = float(
@@ -119,6 +128,8 @@ def certify(
     findings += _apart(cell, seen)
     if findings:
         findings.append(_addition(cell, model, information))
+    elif small := _too_small(cell, numbers):
+        findings = small
     cannot = bool(undetermined) or numbers["axis_spread"] < MIN_AXIS_SPREAD
     outcome: Outcome = "PASS"
     if findings:
@@ -176,8 +187,9 @@ def _findings(
     least = cell.plan.min_plane_spread_deg
     if turns < 2:
         found.append(
-            f"{turns} half-turns: at least 2, in planes {least:.0f} degrees apart, are "
-            "needed to calibrate a camera from three points"
+            f"{turns} half-turn{'' if turns == 1 else 's'}: at least 2, in planes "
+            f"{least:.0f} degrees apart, are needed to calibrate a camera from three "
+            "points"
         )
     elif numbers["plane_spread_deg"] < least:
         found.append(
@@ -196,6 +208,31 @@ def _findings(
         found.append(
             f"markers would agree within {within:.2f} mm (95 %), limit "
             f"{cell.track_limit_mm:.2f} mm"
+        )
+    return found
+
+
+def _too_small(cell: Cell, numbers: Mapping[str, float]) -> list[str]:
+    """Cameras whose own half-turns leave too much open to begin with, and the remedy.
+
+    Such a sigma goes with the square of the triangle's size in the image.
+    """
+    found, factor = [], 1.0
+    for camera in cell.cameras:
+        sigma = numbers[f"alone.{camera.name}.fx_px"]
+        share = sigma / (_WORST_START * camera.focal_px[0])
+        if share > 1:
+            factor = max(factor, float(np.sqrt(share)))
+            found.append(
+                f"camera {camera.name}: its own half-turns leave fx open by "
+                f"{sigma:.0f} px of {camera.focal_px[0]:.0f}, too much to begin a "
+                "calibration with"
+            )
+    if found:
+        found.append(
+            f"Do: make the triangle {np.ceil(10 * factor) / 10:.1f} times larger in "
+            "the images (a larger one, or nearer cameras), or add half-turns that are "
+            "tilted otherwise"
         )
     return found
 

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.camera import INTRINSIC_NAMES
-from handeye_tri.plan.poses import View
+from handeye_tri.plan.poses import HALF_TURN, View
 from handeye_tri.records import (
     MARKER_LABELS,
     Covariance,
     Repeatability,
     motion_labels,
 )
-from handeye_tri.se3 import hat, se3_inverse
+from handeye_tri.se3 import SE3, hat, se3_inverse
 from handeye_tri.triangle import frame_by_markers
 
 Floats = NDArray[np.float64]
@@ -33,6 +33,8 @@ Flags = NDArray[np.bool_]
 _PRIOR_PIXELS = 1000.0
 _PRIOR_LENS = 1.0
 _PRIOR_MOTION = 1.0
+# A camera alone may be known worse than that.
+_WEAKER = 1e-4
 # Places in the workspace box that the track error is predicted at, and how many are
 # drawn to find that many which all cameras see.
 _PLACES = 300
@@ -174,6 +176,49 @@ class StationInformation:
         )
         size = len(self.labels)
         return np.asarray(each.reshape(-1, 2, size, size).sum(axis=1))
+
+    def focal_sigmas_alone(self, base_from_flange: Floats, seen: Flags) -> Floats:
+        """Predicted sigma of each camera's fx from half-turns by itself.
+
+        As a calibration begins (Zhao, Liu and Zhang 2008, Sec. III): one camera, the
+        triangle's sides known, where it is before each half-turn unknown, and after it
+        turned by 180 degrees within the robot's repeatability.
+
+        Args:
+            base_from_flange: Shape (k, 2, 4, 4), metres.
+            seen: Which cameras see all markers before and after, shape (k, m).
+
+        Returns:
+            Shape (m,), pixels.
+        """
+        k = len(base_from_flange)
+        by_unknowns, by_error, _ = self._derivatives(
+            base_from_flange.reshape(-1, 4, 4), np.repeat(seen, 2, axis=0)
+        )
+        # T exp(d) H = T H exp(Ad(H^-1) d).
+        back = SE3(HALF_TURN).inverse().adjoint()
+        sigmas = []
+        for i, (columns, chosen, lens) in enumerate(self._columns):
+            own = range(columns.start, columns.start + len(chosen) + len(lens))
+            error = by_error[:, i].reshape(k, 2, 6, 6)
+            noise = np.zeros((k, 12, 12))
+            for j in range(2):
+                rows = slice(6 * j, 6 * j + 6)
+                noise[:, rows, rows] = (
+                    error[:, j] @ self._pose_covariance @ error[:, j].mT
+                )
+            noise += self.sigma_px**2 * np.eye(12)
+            pose = np.concatenate([error[:, 0], error[:, 1] @ back], axis=1)
+            a = by_unknowns[:, i][..., own].reshape(k, 12, len(own))
+            both = np.concatenate([a, pose], axis=2)
+            normal = both.mT @ np.linalg.solve(noise, both)
+            p = a.shape[2]
+            inner = normal[:, p:, p:] + _WEAKER * np.eye(6) / _PRIOR_MOTION**2
+            cross = normal[:, :p, p:]
+            total = (normal[:, :p, :p] - cross @ _inverse(inner) @ cross.mT).sum(axis=0)
+            total += _WEAKER * self.prior[columns, columns][:p, :p]
+            sigmas.append(np.sqrt(_inverse(total)[0, 0]))
+        return np.array(sigmas)
 
     @cached_property
     def places(self) -> tuple[Floats, Flags]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from functools import cache
 
 import numpy as np
@@ -7,6 +8,7 @@ import planning_scene as scene
 import pytest
 import simulated_calibrations as simulated
 
+from handeye_tri.calibrate_cameras.session_camera import alone
 from handeye_tri.plan.certificate import axis_spread, certify
 from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import HALF_TURN, View
@@ -77,6 +79,103 @@ def test_two_half_turns_in_parallel_planes_are_named():
     )
     assert certificate.outcome == "CANNOT TELL"
     assert "0.0 degrees apart, needs 20" in " ".join(certificate.findings)
+
+
+def test_one_half_turn_says_how_many_are_needed():
+    poses, turns = planned()
+    certificate = certify(
+        scene.cell_of("hp3_stereo"), model_of(), poses[:2], both(poses[:2]), turns[:1]
+    )
+    assert certificate.outcome == "CANNOT TELL"
+    text = "\n".join(certificate.findings)
+    assert "1 half-turn: at least 2, in planes 20 degrees apart, are needed" in text
+    assert "the rotations hardly leave a plane (spread 0.000, needs 0.1)" in text
+    assert re.search(r"camera left: fx would be known to \d+\.\d px only", text)
+    assert re.search(
+        r"Do: add a half-turn with the triangle at \(.*\) m in the world, its plane "
+        r"tilted \d+ degrees against camera left's image, about the image direction "
+        r"\d+ degrees from its x axis; then the calibration's part of the track error "
+        r"is \d\.\d{3} mm$",
+        text,
+    )
+
+
+def test_the_half_turn_that_is_proposed_mends_parallel_planes():
+    """It is made, where it is proposed, and the same stations are judged again."""
+    pose = planned()[0][0]
+    moves = np.array(
+        [
+            [0, 0, 0, 0, 0, 0],
+            [0.03, 0.02, 0.04, 0, 0, 0.4],
+            [-0.03, 0.05, 0.02, 0, 0, 1.0],
+            [0.02, -0.05, -0.05, 0, 0, 2.0],
+        ]
+    )
+    before = pose @ se3_exp(moves)
+    poses = np.stack([before, before @ HALF_TURN], axis=1).reshape(-1, 4, 4)
+    cell, model = scene.cell_of("hp3_stereo"), model_of()
+    turns = np.arange(8).reshape(-1, 2)
+    parallel = certify(cell, model, poses, both(poses), turns)
+    where = re.search(r"\((.*?)\).*tilted (\d+) degrees", parallel.findings[-1])
+    place, tilt = np.array(where[1].split(","), dtype=float), float(where[2])
+    # The proposal is one of these draws: find it by its own words.
+    view = model.view
+    world = view.draw(np.random.default_rng(0), 1500)
+    centres = view.marker_positions(world).mean(axis=1)
+    near = np.flatnonzero(np.abs(centres - place).max(axis=1) < 0.006)
+    camera = view.world_from_camera[0, :3, 2]
+    leans = np.degrees(np.arccos(np.abs(view.normals(world[near]) @ camera)))
+    best = near[np.argmin(np.abs(leans - tilt))]
+    added = model.base_from_world @ world[best]
+    poses = np.concatenate([poses, [added, added @ HALF_TURN]])
+    turns = np.arange(10).reshape(-1, 2)
+    mended = certify(cell, model, poses, both(poses), turns)
+    promised = float(parallel.findings[-1].split("error is ")[1].split(" mm")[0])
+    assert mended.numbers["track_calibration_rms_mm"] == pytest.approx(
+        promised, abs=6e-4
+    )
+    assert mended.numbers["rank"] == mended.numbers["unknowns"]
+
+
+@pytest.mark.parametrize("side", [15, 8])
+def test_a_tiny_triangle_fails_and_a_larger_one_passes(side):
+    """Robot and markers would do, but no camera could begin by itself."""
+    poses, turns = planned()
+
+    def judged(side_mm):
+        rig = {"side_ab_mm": side_mm, "side_ac_mm": 0.92 * side_mm}
+        cell = scene.changed("hp3_stereo", rig={**rig, "marker_radii_mm": [1, 1, 1]})
+        base = scene.arm_of("hp3_stereo").base_from_world.matrix
+        model = StationInformation(View(cell), base, cell.repeatability, 0.03)
+        return certify(cell, model, poses, both(poses), turns)
+
+    tiny = judged(side)
+    assert tiny.outcome == "FAIL"
+    assert re.match(
+        r"camera left: its own half-turns leave fx open by \d+ px of 1720, too much to "
+        r"begin a calibration with",
+        tiny.findings[0],
+    )
+    assert "Do: make the triangle" in tiny.findings[-1]
+    factor = float(re.search(r"(\S+) times larger", tiny.findings[-1])[1])
+    assert 1 < factor < 4
+    larger = judged(1.1 * factor * side)
+    assert (larger.outcome, larger.findings) == ("PASS", ())
+
+
+def test_the_sigma_to_begin_with_is_that_of_a_camera_alone():
+    cell, model = scene.cell_of("hp3_stereo"), model_of()
+    plan = scene.plan_of("hp3_stereo")
+    session, _ = simulated.simulated(
+        cell, model, *simulated.to_calibrate(plan), np.random.default_rng(1)
+    )
+    for i, camera in enumerate(cell.cameras):
+        found = alone(session, i, np.zeros((22, 3, 2)))
+        expected = plan.certificate[f"alone.{camera.name}.fx_px"]
+        # The step itself takes a rougher covariance of the half-turn's miss.
+        assert found.covariance.std(f"{camera.name}.fx") == pytest.approx(
+            expected, rel=0.1
+        )
 
 
 def test_a_tight_limit_fails_and_says_by_how_much():

@@ -64,7 +64,7 @@ def test_what_forbids_a_station_is_named():
 def test_too_few_stations_say_what_to_add():
     plan = certified(planned()[:2])
     assert plan.outcome == "CANNOT TELL"
-    assert "1 half-turns: at least 2" in "\n".join(plan.findings)
+    assert "1 half-turn: at least 2" in "\n".join(plan.findings)
     assert plan.findings[-1].startswith("Do: add a half-turn")
 
 
