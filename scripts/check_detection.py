@@ -10,8 +10,8 @@ its defaults.
 
 ``--hard`` takes views that make it hard to tell the markers from other things: flat
 dots, clutter, a coloured robot, a decoy, glare, a half hidden marker. A centre farther
-than 0.5 px from its marker is wrong; no scene may have one. Where nothing is before or
-behind a marker that has its looks, it must be found. ``-o`` writes a sheet of each view
+than 0.5 px from its marker is wrong; no scene may have one. Where nothing else has a
+marker's looks, it must be found. ``-o`` writes a sheet of each view
 in which a marker is missing.
 """
 
@@ -41,8 +41,8 @@ TIMED_VIEWS = 20
 # Farther off than this, px, a centre in a hard view is wrong.
 WRONG = 0.5
 MAX_RMS = 0.03
-# Scenes in which markers may stand before things of their own colour.
-MAY_MISS = ("clutter", "clutter, grey", "coloured robot")
+# Scenes in which a marker may stand before its own colour, or have a double.
+MAY_MISS = ("clutter", "clutter, grey", "coloured robot", "decoy")
 
 
 def compare(images: list[np.ndarray], spec: MarkerSpec) -> tuple[float, float, float]:
