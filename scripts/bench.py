@@ -5,10 +5,13 @@
 One thread; in each round ours and the peer take turns, and the ratio is the median of
 the rounds' ratios. It counts only where the result is as good as the row demands.
 Row 11 repeats our side of the other rows with default threads against one thread.
-Peers that clash with this project's environment run in that of --peer-python, for which
-`bench_peers.py` says what to install. Exits with 1 where a bar is missed or a peer is
-not installed. Rows, their data and gates are in `bench_<part>.py`, what a row is in
-`bench_rows.py`.
+Peers that clash with this project's environment run in that of --peer-python:
+
+    uv venv PEERS; uv pip install --python PEERS/bin/python \
+        opencv-python-headless==4.14.* gtsam vision-calibration pin-pink mink quadprog
+
+Exits with 1 where a bar is missed or a peer is not installed. Rows, their data and
+gates are in `bench_<part>.py`, what a row is in `bench_rows.py`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 """Peers of the cameras' rows; runs in their environment, which has no handeye_tri.
 
-    uv venv PEERS; uv pip install --python PEERS/bin/python \
-        opencv-python-headless==4.14.* gtsam vision-calibration
-
 Each function takes data and returns the call that is measured.
 """
 

@@ -1,7 +1,4 @@
-"""Peers of row 10 of `bench.py`; runs in their environment, without handeye_tri.
-
-uv pip install --python PEERS/bin/python pin-pink mink quadprog
-"""
+"""Peers of row 10 of `bench.py`; runs in their environment, without handeye_tri."""
 
 from __future__ import annotations
 
