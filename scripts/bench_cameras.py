@@ -12,11 +12,11 @@ from bench_rows import Gate, Measured, Peers, Row, here
 from scipy.optimize import least_squares
 
 from handeye_tri.calibrate_cameras import calibrate_target_views, calibrate_trials
-from handeye_tri.calibrate_cameras.least_squares import one_thread
 from handeye_tri.calibrate_cameras.target_model import TargetModel, TargetState
 from handeye_tri.calibrate_cameras.target_starts import closed_forms
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera, StereoRig
 from handeye_tri.se3 import SE3, rotation_from_quaternion_wxyz, so3_exp
+from handeye_tri.threads import one_thread
 from handeye_tri.triangle import TriangleRig
 
 IMAGE_SIZE = (1024, 768)

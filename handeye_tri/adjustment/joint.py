@@ -15,10 +15,11 @@ from handeye_tri.adjustment.robot import RobotParameters, determined
 from handeye_tri.adjustment.robust import Loss
 from handeye_tri.calibrate_cameras.bundle_input import observations, pairs, unknowns
 from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
-from handeye_tri.calibrate_cameras.least_squares import Minimum, minimise, one_thread
+from handeye_tri.calibrate_cameras.least_squares import Minimum, minimise
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
 from handeye_tri.errors import ConvergenceError, DegenerateMotionError, InputError
 from handeye_tri.records import HandEyeCalibration, Repeatability, Session
+from handeye_tri.threads import one_thread
 from handeye_tri.triangle import EDGES
 
 Floats = NDArray[np.float64]

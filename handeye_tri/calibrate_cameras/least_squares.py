@@ -9,14 +9,14 @@ grows in proportion to the blocks. Unknowns that no residual depends on stay put
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
+
+from handeye_tri.threads import one_thread
 
 Floats = NDArray[np.float64]
 
@@ -240,18 +240,6 @@ def minimise(
             foresee,
             take_last,
         )
-
-
-def one_thread() -> AbstractContextManager[object]:
-    """Keeps numpy's libraries on one thread inside a with statement."""
-    limit: AbstractContextManager[object] = _blas().limit(limits=1)
-    return limit
-
-
-@cache
-def _blas() -> ThreadpoolController:
-    """The libraries behind numpy, found once."""
-    return ThreadpoolController().select(user_api="blas")
 
 
 @cache

@@ -17,7 +17,7 @@ from handeye_tri.calibrate_cameras.degeneracy import (
     MAX_RELATIVE_SIGMA,
     invert_information,
 )
-from handeye_tri.calibrate_cameras.least_squares import Minimum, minimise, one_thread
+from handeye_tri.calibrate_cameras.least_squares import Minimum, minimise
 from handeye_tri.calibrate_cameras.options import lens_choice
 from handeye_tri.calibrate_cameras.target_model import (
     TargetModel,
@@ -36,6 +36,7 @@ from handeye_tri.camera import (
 from handeye_tri.errors import ConvergenceError, DegenerateMotionError, InputError
 from handeye_tri.records import CameraCalibration, Covariance, motion_labels
 from handeye_tri.se3 import SE3, hat
+from handeye_tri.threads import one_thread
 
 Floats = NDArray[np.float64]
 

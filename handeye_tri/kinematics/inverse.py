@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from handeye_tri.kinematics.chain import REACHED, SerialChain
 from handeye_tri.kinematics.systems import columns_of, turn_between
+from handeye_tri.threads import one_thread
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -100,6 +101,13 @@ class InverseKinematics:
             Solutions by target.
         """
         target = np.asarray(base_from_flange, dtype=float).reshape(-1, 4, 4)
+        with one_thread():
+            return self._solve(target, rng, starts, first)
+
+    def _solve(
+        self, target: Floats, rng: np.random.Generator, starts: int, first: bool
+    ) -> InverseSolutions:
+        """See :meth:`solve`."""
         found: list[Floats] = [np.empty((0, len(self.chain)))] * len(target)
         beyond = np.zeros(len(target), dtype=bool)
         left = np.arange(len(target))
