@@ -157,11 +157,11 @@ def _plan_more(session: Path, more: int) -> None:
     try:
         with run.folder.locked():
             progress.begin(1, 1, "plan")
-            made = plan_more(run, more)
+            made, path = plan_more(run, more)
     finally:
         progress.close()
     click.echo(plan_text(made, run.cell.name))
-    click.echo(f"\nWROTE  {run.folder.file('next.csv')}  {len(made.stations)} stations")
+    click.echo(f"\nWROTE  {path}  {len(made.stations)} stations")
     sys.exit(EXIT_CODES[made.outcome])
 
 

@@ -17,7 +17,7 @@ from handeye_tri.exchange.robot_programme import (
 from handeye_tri.pipeline.execution import require
 from handeye_tri.pipeline.run import Run
 from handeye_tri.pipeline.stages import stages_of
-from handeye_tri.records import Plan
+from handeye_tri.records import Floats, Plan
 
 # What each is for, in a few words.
 LAYOUTS = {
@@ -28,12 +28,22 @@ LAYOUTS = {
 }
 
 
-def plan_more(run: Run, half_turns: int) -> Plan:
-    """Half-turns that add most to what a session has observed; writes ``next.csv``.
+# How long the robot stands at a station where nobody says otherwise, seconds.
+_DWELL = 1.0
+
+
+def plan_more(run: Run, half_turns: int) -> tuple[Plan, Path]:
+    """Half-turns that add most to what a session has observed, as a file.
+
+    It is ``next.csv``, or ``next.json`` where ways pass points that a list of stations
+    cannot hold.
 
     Args:
         run: A session whose views were looked at, all or some of them.
         half_turns: How many.
+
+    Returns:
+        The new stations, and the file written.
 
     Raises:
         StorageError: nothing was detected yet.
@@ -56,11 +66,12 @@ def plan_more(run: Run, half_turns: int) -> Plan:
         if turn.before in place and turn.after in place
     ]
     last = max(np.flatnonzero(seen), default=None)
+    here = run.arm.home if last is None else session.stations[last].joints
     visited = Visited(
         session.base_from_flange[used].reshape(-1, 4, 4),
         views[used].reshape(-1, len(session.cameras)),
         np.array(turns, dtype=np.intp).reshape(-1, 2),
-        run.arm.home if last is None else session.stations[last].joints,
+        here,
     )
     plan = plan_next(
         run.designed_cell,
@@ -70,13 +81,14 @@ def plan_more(run: Run, half_turns: int) -> Plan:
         half_turns,
         run.progress.advance,
     )
-    storage.write_joint_list(
-        run.folder.file("next.csv"),
-        run.arm.joint_names,
-        run.arm.slides,
-        np.array([station.joints for station in plan.stations]),
-    )
-    return plan
+    programme = _programme(run, plan, here, _DWELL)
+    listed, whole = (run.folder.file(f"next.{kind}") for kind in ("csv", "json"))
+    straight = not any(len(points) for points in plan.via)
+    path, other = (listed, whole) if straight else (whole, listed)
+    _write(programme, path.suffix[1:], path)
+    # What was planned before is not left beside it.
+    other.unlink(missing_ok=True)
+    return plan, path
 
 
 def planned_outcome(run: Run) -> str:
@@ -103,10 +115,14 @@ def write_programme(run: Run, layout: str, path: Path, dwell: float) -> None:
         InputError: the layout is unknown or cannot hold the programme.
         StorageError: there is no plan, or the file cannot be written.
     """
-    plan, arm = run.plan(), run.arm
-    cell = run.designed_cell
+    _write(_programme(run, run.plan(), run.arm.home, dwell), layout, path)
+
+
+def _programme(run: Run, plan: Plan, start: Floats, dwell: float) -> Programme:
+    """A plan that begins at joints ``start``."""
+    arm, cell = run.arm, run.designed_cell
     outcome = f"verdict {plan.outcome}: " + ("; ".join(plan.findings) or "no finding")
-    programme = Programme(
+    return Programme(
         head=(
             f"handeye-tri: {len(plan.half_turns)} half-turns of cell {cell.name}, "
             f"seed {plan.seed}",
@@ -115,7 +131,7 @@ def write_programme(run: Run, layout: str, path: Path, dwell: float) -> None:
         ),
         joint_names=arm.joint_names,
         slides=arm.slides,
-        home=arm.home,
+        home=start,
         stops=np.array([station.joints for station in plan.stations]),
         kinds=tuple(station.kind for station in plan.stations),
         via=plan.via,
@@ -123,8 +139,12 @@ def write_programme(run: Run, layout: str, path: Path, dwell: float) -> None:
         acceleration_time=cell.arm.acceleration_time_s,
         dwell=dwell,
     )
+
+
+def _write(programme: Programme, layout: str, path: Path) -> None:
+    """A programme in one of LAYOUTS."""
     if layout == "csv":
-        if any(len(points) for points in plan.via):
+        if any(len(points) for points in programme.via):
             raise InputError(
                 "csv holds stations only, and this plan passes points between them; "
                 "choose json, joint_trajectory or urscript"

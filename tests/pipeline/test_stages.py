@@ -299,3 +299,61 @@ def test_what_to_add_is_planned_from_what_was_detected(session):
     assert len(listed) == 5
     # It is no stage: what the session holds stays as it was.
     assert (session / "session.json").read_text() == header
+
+
+def test_what_to_add_counts_what_was_seen_and_starts_where_the_arm_stands(
+    session, monkeypatch
+):
+    """The programme stopped at station 9, and one camera missed station 3."""
+    from dataclasses import replace
+
+    from handeye_tri.pipeline import NullProgress, Run
+    from handeye_tri.pipeline.programme import plan_more
+    from handeye_tri.storage import SessionFolder
+
+    run = Run(SessionFolder.open(session), NullProgress())
+    whole = run.observed()
+    pixels = np.array(whole.pixels)
+    pixels[:, 10:] = pixels[1, 3] = np.nan
+    covariance = np.where(
+        np.isfinite(pixels)[..., None], whole.pixel_covariance, np.nan
+    )
+    part = replace(whole, pixels=pixels, pixel_covariance=covariance)
+    monkeypatch.setattr(Run, "observed", lambda _run: part)
+    more, path = plan_more(run, 2)
+    assert path.is_file()
+    arm, here = run.arm, whole.stations[9].joints
+    for station, via in zip(more.stations, more.via, strict=True):
+        for end in (*via, station.joints):
+            assert arm.path_collision(here, end) is None
+            here = end
+        assert arm.collision(station.joints) is None
+    # Fewer stations were seen than planned: two more do not make up for the rest.
+    assert (
+        more.certificate["track_calibration_rms_mm"]
+        > run.plan().certificate["track_calibration_rms_mm"]
+    )
+    # The other of the two forms is not left over from before.
+    assert len(list(session.glob("next.*"))) == 1
+
+
+def test_ways_round_about_are_not_lost(session, monkeypatch):
+    """A list of stations cannot hold them: the file is then the whole programme."""
+    from dataclasses import replace
+
+    import handeye_tri.plan
+    from handeye_tri.pipeline import NullProgress, Run
+    from handeye_tri.pipeline.programme import plan_more
+    from handeye_tri.storage import SessionFolder
+
+    run = Run(SessionFolder.open(session), NullProgress())
+    via = tuple(np.full((int(k == 1), 6), 0.25) for k in range(len(run.plan().stations)))
+    monkeypatch.setattr(
+        handeye_tri.plan, "plan_next", lambda *_: replace(run.plan(), via=via)
+    )
+    _, path = plan_more(run, 2)
+    assert path.name == "next.json"
+    assert not (session / "next.csv").exists()
+    stations = json.loads(path.read_text())["stations"]
+    assert stations[1]["via"] == [[0.25] * 6]
+    path.unlink()
