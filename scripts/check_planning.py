@@ -14,8 +14,8 @@ station of a half-turn right after the first. Every plan is driven in MuJoCo, lo
 at every millisecond: "touch" counts those at which solids touch.
 
 Seconds of planning are of one core at work, so that other work on the machine does
-not count. Exits with 1 where a plan fails, takes more than 15 s, touches, or takes more than 0.7
-times as long as a random order of its stations.
+not count. Exits with 1 where a plan fails, takes more than 15 s, touches, or takes
+more than 0.7 times as long as a random order of its stations.
 
 Example: python scripts/check_planning.py --seeds 50 --random 200
 """
