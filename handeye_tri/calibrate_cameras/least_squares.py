@@ -24,6 +24,8 @@ _START_DAMPING = 1e-4
 _MAX_DAMPING = 1e12
 # (step / sigma)^2 of the last step taken; the one after would be its square.
 RELATIVE_TOLERANCE = 1e-9
+# Relative rounding of a cost, a sum of very many squares.
+_COST_ROUNDING = 1e-12
 # The most that glibc takes as a threshold is 32 MiB, its own header included.
 _KEPT_BYTES = 32_000_000
 # Minima whose costs differ by a smaller part than this are one minimum.
@@ -299,7 +301,9 @@ def _minimise(
         candidate = retract(state, d_own, d_shared)
         tried = evaluate(candidate)
         tried_cost = np.inf if tried is None else tried.cost
-        if tried is not None and tried_cost <= cost:
+        # A last step gains less than the cost is rounded by: it is taken all the same.
+        rounded = _COST_ROUNDING * cost if negligible else 0.0
+        if tried is not None and tried_cost <= cost + rounded:
             ratio = (cost - tried_cost) / gain if gain > 0 else 1.0
             state, blocks, cost, before = candidate, tried, tried_cost, gain
             damping *= max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)

@@ -123,11 +123,13 @@ def test_an_import_that_was_killed_is_done_again(capsys, both, tmp_path):
 def test_frames_give_the_same_stations_as_joints(capsys, both, tmp_path):
     run, back, _ = both
     bag = back.folder.path.parent / "session.mcap"
+    *used, left_out = run.plan().half_turns
+    named = ",".join(f"{turn.before}-{turn.after}" for turn in used)
     code, out, _ = call(
         *(capsys, "import", "bag", bag, "-o", tmp_path / "tf"),
         *("--robot", "tf:base,flange", "--image", "left=/left/image/compressed"),
-        *("--cell", "hp3_stereo", "--held-out", "16,17"),
-        *("--half-turns", "0-1,2-3,4-5,6-7,8-9"),
+        *("--cell", "hp3_stereo", "--half-turns", named),
+        *("--held-out", f"{left_out.before},{left_out.after}"),
     )
     assert code == 0
     assert "5 half-turns about normal as named" in out
@@ -136,8 +138,9 @@ def test_frames_give_the_same_stations_as_joints(capsys, both, tmp_path):
         difference = one.base_from_flange.matrix - other.base_from_flange.matrix
         assert np.abs(difference).max() < 1e-12
         assert len(other.joints) == 0
-    assert [s.index for s in plan.stations if s.kind == "evaluation"] == [16, 17]
-    assert [(t.before, t.after) for t in plan.half_turns][-1] == (8, 9)
+    held_out = [s.index for s in plan.stations if s.kind == "evaluation"]
+    assert held_out == [left_out.before, left_out.after]
+    assert plan.half_turns == tuple(used)
 
 
 @pytest.mark.parametrize(
@@ -152,12 +155,12 @@ def test_frames_give_the_same_stations_as_joints(capsys, both, tmp_path):
         (["--image", "left=/tf"], "there is no image topic '/tf'"),
         (["--image", "middle=/x"], "the cell has no camera 'middle'"),
         (["--image", "left"], "--image must be CAMERA=WHERE"),
-        (["--half-turns", "0-1,1-2"], "station 1 is named twice"),
-        (["--half-turns", "0-2"], "a half-turn is 180"),
+        (["--half-turns", "{first},{first}"], "is named twice"),
+        (["--half-turns", "{other}"], "a half-turn is 180"),
         (["--half-turns", "0-99"], "station 99 is beyond the 18"),
-        (["--half-turns", "0-1"], "at least 2 are needed"),
+        (["--half-turns", "{first}"], "at least 2 are needed"),
         (["--half-turns", "first"], "--half-turns must be pairs of stations"),
-        (["--held-out", "3"], "station 3 belongs to a half-turn"),
+        (["--held-out", "{after}"], "belongs to a half-turn"),
         (["--held-out", "40"], "names station 40, but there are 18"),
         (["--still", "0.1"], "--still must be mm, degrees and seconds"),
         (["--still", "0.1,0.02,9"], "the robot never stood"),
@@ -169,8 +172,15 @@ def test_frames_give_the_same_stations_as_joints(capsys, both, tmp_path):
 def test_what_does_not_fit_is_one_sentence_and_writes_nothing(
     capsys, both, tmp_path, options, message
 ):
-    _, back, _ = both
+    run, back, _ = both
     bag = back.folder.path.parent / "session.mcap"
+    one, two = run.plan().half_turns[:2]
+    stations = {
+        "first": f"{one.before}-{one.after}",
+        "other": f"{one.before}-{two.after}",
+        "after": one.after,
+    }
+    options = [option.format(**stations) for option in options]
     code, _, err = call(capsys, "import", "bag", bag, "-o", tmp_path / "new", *options)
     assert code == 2
     assert message in err
