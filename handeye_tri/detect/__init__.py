@@ -151,6 +151,7 @@ def _detection(
     pixels = np.full((3, 2), np.nan)
     covariance = np.full((3, 2, 2), np.nan)
     radii = np.full(3, np.nan)
+    edges = np.full((3, 3), np.nan)
     reasons: list[Reason | None] = list(why)
     found = [marker for marker, spot in enumerate(named) if spot is not None]
     if found and outlines is not None:
@@ -158,9 +159,10 @@ def _detection(
         scatter = common_scatter(outlines.scatter[spots])
         pixels[found] = outlines.centres[spots]
         radii[found] = outlines.radii[spots]
+        edges[found] = outlines.edges[spots]
         unseen = (_CURVATURE_ERROR / radii[found]) ** 2
         covariance[found] = scatter[:, None, None] * outlines.gain[spots]
         covariance[found] += unseen[:, None, None] * np.eye(2)
         for marker in found:
             reasons[marker] = None
-    return Detection(pixels, covariance, radii, tuple(reasons))
+    return Detection(pixels, covariance, radii, tuple(reasons), edges)

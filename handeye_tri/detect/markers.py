@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
@@ -131,12 +131,15 @@ class Detection:
             "occluded": too little of its outline shows; "not_round": the outline is
             no ellipse; "no_fit": the fit did not settle; "ambiguous": more than one
             thing could be it.
+        edges: How wide the edge is across direction t: its variance is mean + cos(2t)
+            c + sin(2t) s; (mean, c, s) of A, B, C, shape (3, 3), px^2; NaN = not found.
     """
 
     pixels: Floats
     covariance: Floats
     radii_px: Floats
     reasons: tuple[Reason | None, ...]
+    edges: Floats = field(default_factory=lambda: np.full((3, 3), np.nan))
 
     def __post_init__(self) -> None:
         """Lock the arrays.
@@ -155,6 +158,8 @@ class Detection:
             )
         object.__setattr__(self, "pixels", pixels)
         object.__setattr__(self, "covariance", covariance)
+        edges = locked("edges", self.edges, (3, 3), finite=False)
+        object.__setattr__(self, "edges", edges)
         object.__setattr__(self, "radii_px", radii)
 
     @property

@@ -83,6 +83,7 @@ class Outlines:
         longest: Semi-axes the long way, shape (m,), px: of a flat dot that is seen
             aslant, what it would measure face on.
         levels: Levels inside, shape (m,).
+        edges: How wide the edges are, see :class:`EllipseFit`, (m, 3), px^2.
         reasons: Why an outline is not usable, None where it is.
     """
 
@@ -92,6 +93,7 @@ class Outlines:
     radii: Floats
     longest: Floats
     levels: Floats
+    edges: Floats
     reasons: tuple[Reason | None, ...]
 
 
@@ -116,6 +118,7 @@ def measure(
     seen = kept.mean(axis=1)
     reasons = [_objection(ellipses[k], image_size, seen[k]) for k in range(m)]
     gain, scatter = np.full((m, 2, 2), np.nan), np.full(m, np.nan)
+    edges = np.full((m, 3), np.nan)
     good = np.array([k for k in range(m) if reasons[k] is None], dtype=np.intp)
     if len(good):
         background, weight = _background(
@@ -129,6 +132,7 @@ def measure(
         fit = fit_ellipses(edge, covers, ellipses[good], trusted)
         ellipses[good] = fit.ellipses
         gain[good], scatter[good] = fit.gain, fit.scatter
+        edges[good] = fit.edges
         for k, spot in enumerate(good):
             if (
                 fit.usable[k] < _MIN_USABLE
@@ -148,6 +152,7 @@ def measure(
         ellipses[:, 2] / (1 - flat) ** 0.25,
         ellipses[:, 2] / np.sqrt(1 - np.sqrt(flat)),
         levels,
+        edges,
         tuple(reasons),
     )
 

@@ -2,32 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from difflib import get_close_matches
 
+from handeye_tri.diagnose.cause_explanations import CAUSES
+from handeye_tri.diagnose.explanation import Explanation
 from handeye_tri.errors import InputError
 
-
-@dataclass(frozen=True, slots=True)
-class Explanation:
-    """The long text of a finding.
-
-    Attributes:
-        says: What was found.
-        causes: What brings it about, the likeliest first.
-        numbers: What the figures in its line are, and where the limit comes from.
-        invalidates: What must not be used while it stands, and what still may.
-        remedy: What to do, in order.
-    """
-
-    says: str
-    causes: tuple[str, ...]
-    numbers: str
-    invalidates: str
-    remedy: tuple[str, ...]
-
-
 EXPLANATIONS: dict[str, Explanation] = {
+    **CAUSES,
     "HALF_TURN": Explanation(
         "Between two stations the markers did not turn by 180 degrees about the stated "
         "axis, as the images alone show.",

@@ -121,19 +121,24 @@ def _recalibrate(
 
 
 def judge_session(run: Run, judged: JudgedTrack) -> Verdict:
-    """Run every gate on the session's files."""
-    from handeye_tri.diagnose import assess
-    from handeye_tri.pipeline.robot import with_robot_applied
+    """Run every gate on the session's files, and name what is wrong."""
+    from handeye_tri.diagnose import Evidence, assess, session_causes, with_causes
+    from handeye_tri.pipeline.robot import turning_offsets, with_robot_applied
 
-    session, hand_eye = with_robot_applied(run, run.session(), run.hand_eye())
-    return assess(
-        session,
-        run.cameras(),
+    cameras = run.cameras()
+    session, hand_eye = with_robot_applied(run, run.observed(), run.hand_eye())
+    dropped = cameras.details["dropped"]
+    verdict = assess(
+        session.without(dropped),
+        cameras,
         hand_eye,
         judged.track,
         track_limit=1e-3 * run.cell.track_limit_mm,
         min_plane_spread=float(np.radians(run.cell.plan.min_plane_spread_deg)),
     )
+    joints = turning_offsets(run) if run.has_robot else None
+    evidence = Evidence(session, hand_eye, dropped, joints, run.edges())
+    return with_causes(verdict, session_causes(evidence))
 
 
 def verdict_json(verdict: Verdict) -> dict[str, Any]:

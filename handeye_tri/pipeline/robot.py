@@ -36,13 +36,7 @@ def robot_parameters(run: Run) -> RobotParameters | None:
     joints = np.array([station.joints for station in run.plan().stations])
     sets = []
     if "joint-offsets" in asked:
-        turning = [
-            f"{name}.offset"
-            for name, k in zip(arm.joint_names, arm.mechanism.arm_joints, strict=True)
-            if arm.mechanism.joints[k].kind == "hinge"
-        ]
-        offsets = joint_offsets(arm.joint_names, arm.jacobian(joints))
-        sets.append(offsets.select(turning))
+        sets.append(turning_offsets(run))
     if "link-corrections" in asked:
         bodies = [arm.mechanism.joints[k].body for k in arm.mechanism.arm_joints]
         links = arm.base_from_world.matrix @ arm.body_poses(joints)[:, bodies]
@@ -56,6 +50,18 @@ def robot_parameters(run: Run) -> RobotParameters | None:
     for other in sets[1:]:
         result = result + other
     return result
+
+
+def turning_offsets(run: Run) -> RobotParameters:
+    """Offsets of the turning joints, where :attr:`Run.has_robot`."""
+    arm = run.arm
+    joints = np.array([station.joints for station in run.plan().stations])
+    turning = [
+        f"{name}.offset"
+        for name, k in zip(arm.joint_names, arm.mechanism.arm_joints, strict=True)
+        if arm.mechanism.joints[k].kind == "hinge"
+    ]
+    return joint_offsets(arm.joint_names, arm.jacobian(joints)).select(turning)
 
 
 def with_robot_applied(

@@ -18,6 +18,7 @@ from handeye_tri.records import (
     HandEyeCalibration,
     Plan,
     Session,
+    locked,
 )
 from handeye_tri.storage import SessionFolder, codec
 
@@ -343,6 +344,18 @@ class Run:
         if not self.folder.file("cameras.json").is_file():
             return self.observed()
         return self.observed().without(self.cameras().details["dropped"])
+
+    def edges(self) -> NDArray[np.float64] | None:
+        """How wide the markers' edges are, see :class:`handeye_tri.detect.Detection`.
+
+        None where detection was made by something that does not measure it.
+        """
+        path = self.folder.file("observations.npz")
+        edges = storage.read_arrays(path, (), ("edges",)).get("edges")
+        if edges is None:
+            return None
+        shape = (len(self.cell.cameras), len(self.plan().stations), 3, 3)
+        return locked(f"{path}: edges", edges, shape, finite=False)
 
     def observed(self) -> Session:
         """What the estimators get to know."""

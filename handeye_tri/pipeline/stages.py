@@ -15,6 +15,7 @@ from handeye_tri.errors import InputError, StorageError
 from handeye_tri.pipeline.drawn_robot import drawn_robot
 from handeye_tri.pipeline.evaluation import evaluate, judged_track
 from handeye_tri.pipeline.execution import Stage
+from handeye_tri.pipeline.failing import explained
 from handeye_tri.pipeline.run import (
     CAMERAS_SCHEMA,
     HAND_EYE_SCHEMA,
@@ -111,6 +112,7 @@ def _detect(run: Run) -> tuple[list[str], str]:
     stations = len(run.plan().stations)
     pixels = np.full((len(cameras), stations, 3, 2), np.nan)
     covariance = np.full((len(cameras), stations, 3, 2, 2), np.nan)
+    edges = np.full((len(cameras), stations, 3, 3), np.nan)
     for i, camera in enumerate(cameras):
         for j in range(stations):
             name = run.image_name(camera.name, j)
@@ -125,10 +127,11 @@ def _detect(run: Run) -> tuple[list[str], str]:
                 )
             found = detect_markers(image, spec)
             pixels[i, j], covariance[i, j] = found.pixels, found.covariance
+            edges[i, j] = found.edges
             run.progress.advance(i * stations + j + 1, len(cameras) * stations)
     storage.write_arrays(
         run.folder.file("observations.npz"),
-        {"pixels": pixels, "pixel_covariance": covariance},
+        {"pixels": pixels, "pixel_covariance": covariance, "edges": edges},
     )
     seen = np.isfinite(pixels).all(axis=-1)
     lacking = [
@@ -145,7 +148,8 @@ def _detect(run: Run) -> tuple[list[str], str]:
 def _cameras(run: Run) -> tuple[list[str], str]:
     from handeye_tri.calibrate_cameras import calibrate_session_cameras
 
-    result = calibrate_session_cameras(run.observed())
+    with explained(run):
+        result = calibrate_session_cameras(run.observed())
     storage.write_json(
         run.folder.file("cameras.json"),
         {"schema": CAMERAS_SCHEMA, **codec.camera_calibration_to_json(result)},
@@ -166,10 +170,11 @@ def _hand_eye(run: Run) -> tuple[list[str], str]:
     from handeye_tri.pipeline.robot import robot_parameters
 
     session = run.session()
-    result = calibrate_hand_eye(session, run.cameras())
     parameters = robot_parameters(run)
-    if run.method == "joint":
-        result = adjust(session, result, robot_parameters=parameters)
+    with explained(run):
+        result = calibrate_hand_eye(session, run.cameras())
+        if run.method == "joint":
+            result = adjust(session, result, robot_parameters=parameters)
     storage.write_json(
         run.folder.file("hand_eye.json"),
         {"schema": HAND_EYE_SCHEMA, **codec.hand_eye_to_json(result)},

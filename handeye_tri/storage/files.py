@@ -139,8 +139,10 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Read named arrays; nothing in the file is executed.
+def read_arrays(
+    path: Path, names: tuple[str, ...], optional: tuple[str, ...] = ()
+) -> dict[str, NDArray[Any]]:
+    """Read named arrays, and optional ones if there; nothing in the file is executed.
 
     Raises:
         StorageError: missing, damaged, too large, or an array is absent.
@@ -155,7 +157,11 @@ def read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
                     f"{_MAX_BYTES} allowed; it cannot be one of our files"
                 )
             absent = [name for name in names if name not in archive.files]
-            arrays = {name: archive[name] for name in names if name not in absent}
+            arrays = {
+                name: archive[name]
+                for name in (*names, *optional)
+                if name in archive.files
+            }
     except StorageError:
         raise
     except Exception as error:

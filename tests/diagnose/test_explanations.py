@@ -64,5 +64,5 @@ def test_an_unknown_code_names_those_there_are(capsys):
         cli.main(["explain", "x\ny"])
     assert left.value.code == 2
     err = capsys.readouterr().err
-    assert "There are CLOCKS, DROPPED" in err
+    assert "There are BLUR, CAMERA_MOVED, CLOCKS" in err
     assert len(err.splitlines()) == 1

@@ -33,6 +33,7 @@ def test_a_mislabelled_view_is_left_out_everywhere_and_named(tmp_path):
     judged = evaluation.judged_track(run, run.session(), run.hand_eye())
     verdict = evaluation.judge_session(run, judged)
     assert verdict.outcome == "PASS"
-    (finding,) = verdict.findings
-    assert finding.code == "DROPPED"
-    assert said in finding.evidence
+    named, dropped = verdict.findings
+    assert (named.code, dropped.code) == ("LABELS", "DROPPED")
+    assert (named.stations, named.camera) == ((turn.after,), name)
+    assert said in dropped.evidence

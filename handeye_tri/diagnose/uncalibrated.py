@@ -1,0 +1,211 @@
+"""Why a session does not calibrate at all: other readings of it are tried."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handeye_tri.adjustment import RobotParameters
+from handeye_tri.calibrate_cameras import (
+    calibrate_cameras_general,
+    calibrate_session_cameras,
+)
+from handeye_tri.diagnose.gates import Finding
+from handeye_tri.diagnose.images import blurred_views, image_findings
+from handeye_tri.diagnose.pose_pairs import assess_pose_pairs
+from handeye_tri.diagnose.session_causes import Evidence, session_causes, turn_findings
+from handeye_tri.diagnose.sides import unit_words
+from handeye_tri.errors import HandEyeError
+from handeye_tri.hand_eye import (
+    calibrate_hand_eye,
+    solve_pose_pairs,
+    solve_readings,
+)
+from handeye_tri.hand_eye.observed_poses import triangle_poses
+from handeye_tri.records import CameraCalibration, PosePairs, Session
+from handeye_tri.se3 import so3_log
+from handeye_tri.triangle import VERTICES
+
+Floats = NDArray[np.float64]
+
+# A reading that calibrates is believed up to this chi2 per degree of freedom.
+_BELIEVED = 4.0
+_SHIFTS = {1: "after", -1: "before"}
+
+
+def why_uncalibrated(
+    session: Session,
+    *,
+    min_plane_spread: float,
+    joints: RobotParameters | None = None,
+    edges: Floats | None = None,
+) -> tuple[Finding, ...]:
+    """Name what is wrong with a session on which calibration gave up.
+
+    Where the cameras calibrate, robot and cameras contradict each other, and the
+    readings of bare pose pairs are solved: inverted, shifted, in another unit. Where
+    they do not, images that belong to the next or the last station, or markers that
+    bear each other's names everywhere, would make half-turns that are none. Last, the
+    cameras are calibrated as if the motions were general ones, and the causes of
+    :func:`session_causes` compete on that.
+
+    Args:
+        session: What was detected.
+        min_plane_spread: Least accepted angle between half-turn planes, radians.
+        joints: See :class:`Evidence`.
+        edges: See :class:`Evidence`.
+    """
+    if not session.half_turns:
+        return ()
+    few = _too_little_turning(session, min_plane_spread)
+    if few is not None:
+        return (few,)
+    findings = image_findings(session, blurred_views(session, edges), edges)
+    if findings:
+        return tuple(findings)
+    cameras = _cameras(session)
+    if cameras is not None:
+        return _readings(session.without(cameras.details["dropped"]), cameras)
+    # Shifted by two, half-turns are half-turns again: only robot and cameras together
+    # tell which way.
+    misfits = {word: _misfit(_shifted(session, k)) for k, word in _SHIFTS.items()}
+    word = min(misfits, key=lambda word: misfits[word])
+    if misfits[word] < _BELIEVED:
+        return (
+            Finding(
+                "READING",
+                f"each image belongs to the robot pose {word} it",
+                f"so paired, chi2/dof of the loop is {misfits[word]:.2f}; as stated, "
+                "the half-turns are none",
+                "error",
+                "find out which pose each image was taken at, and pair them anew",
+            ),
+        )
+    for order in list(permutations(range(3)))[1:]:
+        named = replace(
+            session,
+            pixels=session.pixels[:, :, list(order)],
+            pixel_covariance=session.pixel_covariance[:, :, list(order)],
+        )
+        if _cameras(named) is not None:
+            names = ", ".join(VERTICES[k] for k in order)
+            return (
+                Finding(
+                    "LABELS",
+                    f"the markers are named wrongly everywhere: A, B, C are {names}",
+                    "so named, the cameras calibrate; as stated they do not",
+                    "error",
+                    "correct rig.marker_colours or marker_radii_mm, or the sides",
+                ),
+            )
+    return _on_general_motions(session, joints) or tuple(
+        turn_findings(session, frozenset())
+    )
+
+
+def _on_general_motions(
+    session: Session, joints: RobotParameters | None
+) -> tuple[Finding, ...]:
+    """What is wrong, where the half-turns need not be half-turns."""
+    infos = session.cameras
+    held = session.indices("evaluation")
+    pixels = session.pixels.copy()
+    pixels[:, held] = np.nan
+    try:
+        cameras = calibrate_cameras_general(
+            pixels,
+            session.triangle,
+            image_sizes=[info.image_size for info in infos],
+            skew=all(info.skew for info in infos),
+            distortion=infos[0].lens or None,
+            covariance=session.pixel_covariance,
+            names=[info.name for info in infos],
+        )
+        calibration = calibrate_hand_eye(session, cameras)
+        return session_causes(Evidence(session, calibration, joints=joints))
+    except HandEyeError:
+        return ()
+
+
+def _cameras(session: Session) -> CameraCalibration | None:
+    """The calibrated cameras, None where they are not believable."""
+    try:
+        found = calibrate_session_cameras(session)
+    except HandEyeError:
+        return None
+    return found if found.chi2 < _BELIEVED * found.dof else None
+
+
+def _misfit(session: Session) -> float:
+    """chi2 per degree of freedom of the loop; infinite where nothing calibrates."""
+    cameras = _cameras(session)
+    if cameras is None:
+        return np.inf
+    try:
+        found = calibrate_hand_eye(session.without(cameras.details["dropped"]), cameras)
+    except HandEyeError:
+        return np.inf
+    return found.chi2 / found.dof
+
+
+def _shifted(session: Session, shift: int) -> Session:
+    """Every image beside the pose of the station after it (1) or before it (-1)."""
+    pixels = np.roll(session.pixels, shift, axis=1)
+    covariance = np.roll(session.pixel_covariance, shift, axis=1)
+    # What went round the end belongs nowhere.
+    edge = 0 if shift > 0 else -1
+    pixels[:, edge], covariance[:, edge] = np.nan, np.nan
+    return replace(session, pixels=pixels, pixel_covariance=covariance)
+
+
+def _too_little_turning(session: Session, least: float) -> Finding | None:
+    """Whether the rig hardly turned but for the half-turns."""
+    poses = session.base_from_flange[[turn.before for turn in session.half_turns]]
+    rotations = poses[:, :3, :3]
+    between = so3_log(np.swapaxes(rotations[:, None], -1, -2) @ rotations[None])
+    spread = float(np.linalg.norm(between, axis=-1).max())
+    if spread >= least:
+        return None
+    return Finding(
+        "MOTION",
+        "the planes of the half-turns are nearly parallel",
+        f"the rig turned by {np.degrees(spread):.1f} degrees at most between "
+        f"half-turns (needs {np.degrees(least):.0f})",
+        "error",
+        "add half-turns tilted by 30 degrees about another axis",
+    )
+
+
+def _readings(session: Session, cameras: CameraCalibration) -> tuple[Finding, ...]:
+    """What the poses of robot and triangle say as bare pairs."""
+    stations = session.indices("calibration")
+    try:
+        observed = triangle_poses(
+            session.triangle,
+            cameras,
+            session.pixels[:, stations],
+            session.pixel_covariance[:, stations],
+            session.marker_radii,
+        )
+        pairs = PosePairs(
+            session.base_from_flange[stations[observed.views]],
+            observed.reference_from_triangle,
+            "eye_to_hand",
+            "flange_in_base",
+            "target_in_camera",
+        )
+        solution = solve_pose_pairs(pairs)
+        readings = solve_readings(solution, pairs)
+        verdict = assess_pose_pairs(pairs, solution, readings, None)
+    except HandEyeError:
+        return ()
+    factor = next(one.scale for one in readings if one.key == "scaled")
+    return tuple(
+        replace(one, code="UNIT", cause=one.cause + unit_words(factor))
+        if one.code == "SCALE"
+        else one
+        for one in verdict.findings
+    )
