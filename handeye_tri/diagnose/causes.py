@@ -174,5 +174,5 @@ def best_cause(
 
 
 def turned_angle(before: Floats, after: Floats) -> float:
-    """Angle between two orientations of the flange, radians."""
+    """Angle between two orientations of the flange, shape (4, 4) each, radians."""
     return float(np.linalg.norm(so3_log(before[:3, :3].T @ after[:3, :3])))

@@ -43,7 +43,7 @@ def blurred_views(session: Session, edges: Floats | None) -> list[tuple[int, int
 
     Args:
         session: How well the markers were found, which the width of their edges shares.
-        edges: See :func:`drawn_out`.
+        edges: See :func:`drawn_out`, (m, n, 3, 3), px^2; None where not measured.
     """
     if edges is None:
         return []
@@ -62,7 +62,13 @@ def blurred_views(session: Session, edges: Floats | None) -> list[tuple[int, int
 def image_findings(
     session: Session, blurred: list[tuple[int, int]], edges: Floats | None
 ) -> list[Finding]:
-    """Findings that need no geometry."""
+    """Findings that need no geometry.
+
+    Args:
+        session: What was detected.
+        blurred: What :func:`blurred_views` found.
+        edges: What it found it in, (m, n, 3, 3), px^2; None where not measured.
+    """
     names = [info.name for info in session.cameras]
     findings = []
     if blurred and edges is not None:

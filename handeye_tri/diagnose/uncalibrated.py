@@ -56,7 +56,7 @@ def why_uncalibrated(
         session: What was detected.
         min_plane_spread: Least accepted angle between half-turn planes, radians.
         joints: See :class:`Evidence`.
-        edges: See :class:`Evidence`.
+        edges: See :class:`Evidence`, (m, n, 3, 3), px^2; None where not measured.
     """
     if not session.half_turns:
         return ()

@@ -76,7 +76,13 @@ class RenderedCell:
     def rendered(
         self, cell: Cell, joints: Floats, views: Iterable[View]
     ) -> dict[View, Image]:
-        """Images of some views of a cell whose truth may be another."""
+        """Images of some views of a cell whose truth may be another.
+
+        Args:
+            cell: The cell as it then is.
+            joints: Where the robot then is at each station, shape (n, q), rad or m.
+            views: Camera and station of each.
+        """
         drawn = simulate.render_views(cell, self.model_path, joints, self.seed, views)
         return {(i, j): image for i, j, image in drawn}
 
