@@ -347,7 +347,9 @@ def test_ways_round_about_are_not_lost(session, monkeypatch):
     from handeye_tri.storage import SessionFolder
 
     run = Run(SessionFolder.open(session), NullProgress())
-    via = tuple(np.full((int(k == 1), 6), 0.25) for k in range(len(run.plan().stations)))
+    via = tuple(
+        np.full((int(k == 1), 6), 0.25) for k in range(len(run.plan().stations))
+    )
     monkeypatch.setattr(
         handeye_tri.plan, "plan_next", lambda *_: replace(run.plan(), via=via)
     )
