@@ -3,7 +3,7 @@
 The only module that talks to Pinocchio. Its model is built from the arrays of a
 :class:`~handeye_tri.mechanism.Mechanism`, so that it agrees with the simulator for
 any robot. Batched kinematics run in numpy on the placements of that model
-(kinematics.py); shapes and cones of sight are coal's (solids.py).
+(kinematics); shapes and cones of sight are coal's (solids.py).
 """
 
 from __future__ import annotations
