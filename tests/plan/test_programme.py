@@ -16,6 +16,7 @@ from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import View
 from handeye_tri.simulate import compile_mechanism
 from handeye_tri.simulate.compile import compile_cell
+from handeye_tri.simulate.truth import execute
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -301,6 +302,9 @@ def test_a_seven_joint_arm_whose_flange_leans_is_planned_for(tmp_path):
         np.testing.assert_allclose(poses[before] @ HALF_TURN, poses[after], atol=1e-9)
         # The last joint alone cannot do it: the others move as well.
         assert np.abs(joints[after, :-1] - joints[before, :-1]).max() > 0.01
+    executed = arm.forward(execute(arm, plan, cell.repeatability, 1))
+    missed = np.linalg.norm(executed[:, :3, 3] - poses[:, :3, 3], axis=1)
+    assert 0 < missed.max() < 6 * cell.repeatability.translation
     points = [arm.home]
     for station, via in zip(plan.stations, plan.via, strict=True):
         points += [*via, station.joints]
