@@ -304,7 +304,7 @@ def _minimise(
         # A last step gains less than the cost is rounded by: it is taken all the same.
         rounded = _COST_ROUNDING * cost if negligible else 0.0
         if tried is not None and tried_cost <= cost + rounded:
-            ratio = (cost - tried_cost) / gain if gain > 0 else 1.0
+            ratio = max((cost - tried_cost) / gain, 0.0) if gain > 0 else 1.0
             state, blocks, cost, before = candidate, tried, tried_cost, gain
             damping *= max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
             growth = 2.0
