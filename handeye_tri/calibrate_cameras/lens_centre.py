@@ -33,7 +33,8 @@ Floats = NDArray[np.float64]
 
 # What the lens is centred at.
 CENTRE = ("cx", "cy")
-# Of the quadrature along each of cx and cy; with 7 NEES changes by less than 0.02.
+# Of the quadrature along each of cx and cy. Three are too few; more change NEES by a
+# few hundredths at most where the noise is large (1 px, four coefficients).
 _NODES = 5
 # Predicted gain over chi2 / dof of a node's last step: far below the 1 that counts.
 TOLERANCE = 1e-6
