@@ -197,7 +197,9 @@ def _start(
             "different axes"
         )
     found = find_consensus(a, b, free_scale=data.free_scale, seed=seed)
-    if turned < NO_TURN or turns_are_few(a, b, found.x, found.z):
+    # Only among the poses that agree does a misfit tell the noise.
+    right = found.agreeing
+    if turned < NO_TURN or turns_are_few(a[right], b[right], found.x, found.z):
         # A scale cannot be told from a shift here unless positions do: start at 1.
         x, z = start_from_few_axes(a, b)
         return replace(data, few_axes=True), x, z, 1.0, np.ones(len(a), bool)

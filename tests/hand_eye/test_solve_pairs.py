@@ -93,6 +93,19 @@ def test_wrong_poses_are_named_and_do_no_harm():
         assert len(clean.dropped) <= 1
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_half_of_the_poses_may_be_wrong(seed):
+    robot, observed, x, _ = scene(seed, 30)
+    rng = np.random.default_rng(seed)
+    wrong = rng.permutation(30)[:15]
+    observed[wrong, :3, :3] = random_poses(rng, 15)[:, :3, :3]
+    found = solve_pose_pairs(pairs_of(robot, observed))
+    assert found.undetermined == ()
+    assert {int(name) for name in found.dropped} >= set(wrong)
+    assert len(found.dropped) <= 16
+    assert np.degrees((found.x.inverse() @ SE3(x)).angle) < 0.5
+
+
 def test_a_wrong_pose_that_is_only_a_little_wrong_is_noticed():
     robot, observed, _, _ = scene(3, 25)
     robot[7] = robot[7] @ se3_exp([0.02, 0, 0, 0, 0.02, 0])
