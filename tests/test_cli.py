@@ -177,7 +177,7 @@ def test_plan_judges_a_users_own_stations(capsys, tmp_path):
     )
     assert code == 4
     assert out.startswith("VERDICT  CANNOT TELL")
-    assert "1 half-turns: at least 2" in out
+    assert "1 half-turn: at least 2" in out
     assert "Do: add a half-turn" in out
     assert (tmp_path / "out" / "plan.json").is_file()
 

@@ -45,6 +45,7 @@ def keys_of(model: type[BaseModel], prefix: str = "") -> dict[str, FieldInfo]:
 def documented() -> dict[str, tuple[bool, str]]:
     """Keys of the README's table: whether a default is stated, and the unit."""
     _, table = (SCENES / "README.md").read_text().split("## Keys")
+    table = table.split("\n## ")[0]
     rows = re.findall(r"^\| `([\w.\[\]]+)`( \*)? \| *([^|]*?) *\|", table, re.MULTILINE)
     return {key: (bool(star), unit) for key, star, unit in rows}
 
