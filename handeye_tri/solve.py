@@ -21,10 +21,8 @@ from handeye_tri.hand_eye import (
 )
 from handeye_tri.records import Floats, PosePairs, motion_labels
 from handeye_tri.se3 import SE3, quaternion_wxyz, se3_adjoint
-from handeye_tri.summary import digits, motion_rows
+from handeye_tri.summary import LINE_WIDTH, digits, motion_rows, wrapped
 
-# Of a line of text; a table of long names may be wider.
-_WIDTH = 88
 # Poses whose residuals are listed at most, unless more were dropped.
 _LISTED = 60
 # Digits after the point that mean something: nanometres.
@@ -138,8 +136,8 @@ def _verdict_lines(solved: SolvedPairs) -> list[str]:
         f"VERDICT  {verdict.outcome}      {len(solution.poses)} poses, "
         f"{solved.pairs.mounting.replace('_', '-')}, {len(met)} of {len(ran)} gates "
         f"met, {len(gates) - len(ran)} not run",
-        *_wrapped(verdict.sentence),
-        *_wrapped(f"Nearest to failing: {verdict.nearest}."),
+        *wrapped(verdict.sentence),
+        *wrapped(f"Nearest to failing: {verdict.nearest}."),
         f"  {'gate':<{name + 3}}{'found':<{found}}{'limit':<{limit}}{'verdict':<10}"
         "blind to",
     ]
@@ -149,28 +147,17 @@ def _verdict_lines(solved: SolvedPairs) -> list[str]:
             f"{gate.limit:<{limit}}{gate.verdict:<10}{gate.blind_to}"
         )
     for finding in verdict.findings:
-        lines += _wrapped(f"{finding.code}: {finding.cause}; {finding.evidence}")
-        lines += _wrapped(f"Do: {finding.remedy}.", 4)
+        lines += wrapped(f"{finding.code}: {finding.cause}; {finding.evidence}")
+        lines += wrapped(f"Do: {finding.remedy}.", 4)
     lines += ["", "READINGS  of the same numbers, each solved (medians over all poses)"]
     for reading in solved.readings:
         numbers = (
             f"{1e3 * reading.position:>12.3f} mm {np.degrees(reading.angle):>9.4f} deg"
         )
-        first, *rest = wrap(f"{reading.key}: {reading.meaning}", _WIDTH - 32)
+        first, *rest = wrap(f"{reading.key}: {reading.meaning}", LINE_WIDTH - 32)
         lines.append(f"{numbers}   {first}")
         lines += [" " * 34 + line for line in rest]
     return lines
-
-
-def _wrapped(text: str, indent: int = 2) -> list[str]:
-    """Lines of a sentence; what goes on is indented once more."""
-    return wrap(
-        text,
-        _WIDTH,
-        initial_indent=" " * indent,
-        subsequent_indent=" " * (indent + 2),
-        break_on_hyphens=False,
-    )
 
 
 def _open_rows(solution: PoseSolution, motion: SE3, name: str) -> NDArray[np.bool_]:
@@ -224,7 +211,7 @@ def _motion_lines(solved: SolvedPairs) -> list[str]:
         number = _number(1e3 * solution.clock_offset, sigma)
         lines.append(f"  {'camera clock - robot clock, ms':<30}{number}")
     for one in solution.undetermined:
-        lines += _wrapped(f"OPEN: {one.text}")
+        lines += wrapped(f"OPEN: {one.text}")
     return lines
 
 

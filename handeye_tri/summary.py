@@ -21,6 +21,22 @@ Floats = NDArray[np.float64]
 _ROBOT_UNITS = {axis: (1e3, "mm") for axis in "xyz"}
 
 
+# Columns of a line of text; a table of long names may be wider.
+LINE_WIDTH = 88
+
+
+def wrapped(text: str, indent: int = 2) -> list[str]:
+    """Lines of a sentence; what goes on is indented once more."""
+    return wrap(
+        text,
+        LINE_WIDTH,
+        initial_indent=" " * indent,
+        subsequent_indent=" " * (indent + 2),
+        break_on_hyphens=False,
+        break_long_words=False,
+    )
+
+
 def digits(sigma: float) -> int:
     """Decimals that show two significant digits of a standard deviation."""
     if not math.isfinite(sigma) or sigma <= 0:
@@ -123,7 +139,15 @@ def check_text(checked: Mapping[str, Any]) -> str:
     Args:
         checked: Its verdict, as in ``evaluation.json``, and what became of its files.
     """
-    lines = _verdict(checked, [])
+    if checked["track"] is None:
+        source = "SIMULATED" if checked["simulated"] else "REAL"
+        lines = [
+            f"VERDICT  {checked['verdict']}      {source}, not calibrated, no gate run",
+            *wrapped(checked["sentence"]),
+            *_findings(checked["findings"]),
+        ]
+    else:
+        lines = _verdict(checked, [])
     lines += ["", f"FILES  {checked['files_verified']} as recorded (SHA-256)"]
     for stage in checked["stale"]:
         lines.append(f"STALE  {stage['stage']}: {stage['why']}; {stage['command']}")
@@ -160,11 +184,21 @@ def _verdict(evaluation: Mapping[str, Any], remarks: Sequence[str]) -> list[str]
             f"  {number} {gate['name']:<30}{gate['found']:<16}{gate['limit']:<16}"
             f"{gate['verdict']:<10}{gate['blind_to']}"
         )
-    for finding in evaluation["findings"]:
-        lines += [
-            f"  {finding['code']}: {finding['cause']}; {finding['evidence']}",
-            f"    Do: {finding['remedy']}.",
-        ]
+    return lines + _findings(evaluation["findings"])
+
+
+def _findings(findings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What is wrong and what to do; what follows from it, without."""
+    lines = []
+    for finding in findings:
+        said = f"{finding['cause']}; {finding['evidence']}"
+        if finding["follows"]:
+            lines += wrapped(
+                f"{finding['code']}, likely from {finding['follows']}: {said}", 4
+            )
+        else:
+            lines += wrapped(f"{finding['code']}: {said}")
+            lines += wrapped(f"Do: {finding['remedy']}.", 4)
     return lines
 
 

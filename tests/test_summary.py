@@ -1,10 +1,11 @@
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
+from handeye_tri.diagnose import Finding
 from handeye_tri.hand_eye import calibrate_hand_eye
 from handeye_tri.records import Covariance, Repeatability
 from handeye_tri.summary import digits, result_rows, round_magnification, summary_text
@@ -135,13 +136,17 @@ def test_without_truth_there_is_no_truth_column(calibrated):
 
 
 def test_findings_are_told_with_what_to_do(calibrated):
-    finding = {
-        "code": "SCALE", "cause": "metres differ", "evidence": "1.01",
-        "remedy": "measure again",
-    }  # fmt: skip
-    text = summary_text(evaluation(calibrated, findings=[finding]), Path("out"), [])
-    assert "SCALE: metres differ; 1.01" in text
-    assert "Do: measure again." in text
+    findings = [
+        Finding("SIDES", "sides differ", "1.01", "warning", "measure again"),
+        Finding("LOOP", "noise " * 20, "1.9", "error", "look", follows="SIDES"),
+    ]
+    told = evaluation(calibrated, findings=[asdict(one) for one in findings])
+    text = summary_text(told, Path("out"), [])
+    assert "\n  SIDES: sides differ; 1.01\n    Do: measure again.\n" in text
+    assert "\n    LOOP, likely from SIDES: noise noise" in text
+    assert "Do: look" not in text
+    told = text[text.index("SIDES") : text.index("RESULT")]
+    assert max(map(len, told.splitlines())) <= 88
 
 
 @pytest.mark.parametrize(

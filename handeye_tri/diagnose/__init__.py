@@ -4,7 +4,7 @@ from handeye_tri.diagnose.assess import assess, free_scale, radius_95
 from handeye_tri.diagnose.gates import Finding, Gate, Verdict, judge
 from handeye_tri.diagnose.pose_pairs import assess_pose_pairs
 from handeye_tri.diagnose.session_causes import Evidence, session_causes, with_causes
-from handeye_tri.diagnose.uncalibrated import why_uncalibrated
+from handeye_tri.diagnose.uncalibrated import uncalibrated_verdict, why_uncalibrated
 
 __all__ = [
     "Evidence",
@@ -17,6 +17,7 @@ __all__ = [
     "judge",
     "radius_95",
     "session_causes",
+    "uncalibrated_verdict",
     "why_uncalibrated",
     "with_causes",
 ]

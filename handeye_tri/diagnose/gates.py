@@ -18,6 +18,8 @@ Outcome = Literal["PASS", "FAIL", "CANNOT TELL"]
 # Code, cause, what to do.
 Remedy = tuple[str, str, str]
 
+# Name of the gate that holds the held-out track against its prediction.
+PREDICTION_GATE = "held-out track / predicted"
 # Within this share of its limit a gate that is met is called marginal.
 _MARGINAL = 0.85
 
@@ -59,6 +61,8 @@ class Finding:
         remedy: What to do.
         stations: Indices of the stations that it is about; none where it is about all.
         camera: Name of the camera that it is about; "" where it is about all.
+        follows: Code of the finding that it most likely follows from; "" for one that
+            stands by itself.
     """
 
     code: str
@@ -68,6 +72,7 @@ class Finding:
     remedy: str
     stations: tuple[int, ...] = ()
     camera: str = ""
+    follows: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +84,7 @@ class Verdict:
         sentence: The headline in millimetres.
         gates: All gates, those not run included.
         nearest: The gate closest to failing (or failing most), in words.
-        findings: What is wrong, worst first.
+        findings: What is wrong, worst first; what follows from others comes last.
     """
 
     outcome: Outcome
@@ -205,7 +210,7 @@ def prediction_gate(ratio: float) -> Gate:
     """
     use = ratio / 2.0
     return Gate(
-        "held-out track / predicted",
+        PREDICTION_GATE,
         f"{ratio:.2f}",
         "2.00",
         graded(use),
@@ -248,7 +253,7 @@ _REMEDIES: dict[str, Remedy] = {
         "the held-out track is worse than the cell allows",
         "see which findings stand beside this one; add half-turns, or mend the cause",
     ),
-    "held-out track / predicted": (
+    PREDICTION_GATE: (
         "PREDICTION",
         "the held-out track is worse than its own prediction",
         "the noise is larger than stated or a model is wrong: look at the residuals",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from handeye_tri.adjustment import RobotParameters
 from handeye_tri.diagnose.causes import best_cause, possible_causes, turned_angle
-from handeye_tri.diagnose.gates import Finding, Verdict
+from handeye_tri.diagnose.gates import PREDICTION_GATE, Finding, Verdict
 from handeye_tri.diagnose.images import blurred_views, image_findings
 from handeye_tri.diagnose.loop import Cause, Fit, Loop
 from handeye_tri.diagnose.odd_views import OddView, odd_views
@@ -23,6 +23,9 @@ Bools = NDArray[np.bool_]
 # A cause, chi2 before it, and the cell as it has it.
 Explained = tuple[Cause, float, Fit]
 
+# Kinds of causes at single stations, and everywhere by a model of few numbers.
+_SINGLE = ("turn", "pose", "view")
+_EVERYWHERE = ("clock", "joint")
 # Causes that are looked for one after the other.
 _MOST = 8
 # A reported half-turn may miss 180 degrees by this, radians, and by so many sigmas.
@@ -90,7 +93,7 @@ def session_causes(evidence: Evidence) -> tuple[Finding, ...]:
         *image_findings(session, blurred, evidence.edges),
         *_odd_findings(odd, names),
         *turn_findings(session, {c.station for c, _, _ in found if c.kind == "pose"}),
-        *_cause_findings(found, names),
+        *_cause_findings(found, names, "BLUR" if blurred else ""),
     ]
     side = side_finding(session, fit)
     return tuple(findings if side is None else [*findings, side])
@@ -99,12 +102,26 @@ def session_causes(evidence: Evidence) -> tuple[Finding, ...]:
 def with_causes(verdict: Verdict, causes: Sequence[Finding]) -> Verdict:
     """The verdict with the causes before what follows from them.
 
-    What is wrong with the whole session is not passed, whatever the gates say.
+    What is wrong with the whole session is not passed, whatever the gates say. Where
+    all is passed nonetheless, each cause says what shows that the result holds.
     """
+    if not causes:
+        return verdict
+    own = sorted((one for one in causes if not one.follows), key=_is_mild)
+    symptoms = [replace(one, follows=own[0].code) for one in verdict.findings]
+    further = [one for one in causes if one.follows]
     outcome = verdict.outcome
     if outcome == "PASS" and any(one.severity == "error" for one in causes):
         outcome = "FAIL"
-    return replace(verdict, outcome=outcome, findings=(*causes, *verdict.findings))
+    if outcome == "PASS":
+        (gate,) = (gate for gate in verdict.gates if gate.name == PREDICTION_GATE)
+        holds = f"; the result holds: {gate.name} {gate.found} (limit {gate.limit})"
+        own = [replace(one, evidence=one.evidence + holds) for one in own]
+    return replace(verdict, outcome=outcome, findings=(*own, *further, *symptoms))
+
+
+def _is_mild(finding: Finding) -> bool:
+    return finding.severity != "error"
 
 
 def _robust_start(evidence: Evidence, usable: Bools) -> Fit:
@@ -197,8 +214,21 @@ def turn_findings(session: Session, misreported: Set[int]) -> list[Finding]:
     ]
 
 
-def _cause_findings(found: list[Explained], names: list[str]) -> list[Finding]:
-    """A finding for each kind, in the order in which they explained most."""
+def _cause_findings(
+    found: list[Explained], names: list[str], moving: str
+) -> list[Finding]:
+    """A finding for each kind, in the order in which they explained most.
+
+    How far a robot had got when its images were taken, or how its joints are off, is
+    known by a model of few numbers. What single stations are off beside such a cause is
+    what the model leaves of it, more likely than a further cause.
+
+    Args:
+        found: The causes.
+        names: The cameras' names.
+        moving: Code of the finding that the robot moved at single stations; "" where
+            it did not.
+    """
     kinds: dict[str, list[Explained]] = {}
     for one in found:
         kind = "joint" if one[0].kind == "joints" else one[0].kind
@@ -212,7 +242,15 @@ def _cause_findings(found: list[Explained], names: list[str]) -> list[Finding]:
         "pose": _pose_finding,
         "view": _view_finding,
     }
-    return [makers[kind](group, names) for kind, group in kinds.items()]
+    findings = []
+    for kind, group in kinds.items():
+        finding = makers[kind](group, names)
+        if kind in _SINGLE and moving:
+            finding = replace(finding, follows=moving)
+        elif kind in _EVERYWHERE:
+            moving = finding.code
+        findings.append(finding)
+    return findings
 
 
 def _fall(group: list[Explained]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations
 
@@ -13,12 +14,12 @@ from handeye_tri.calibrate_cameras import (
     calibrate_cameras_general,
     calibrate_session_cameras,
 )
-from handeye_tri.diagnose.gates import Finding
+from handeye_tri.diagnose.gates import Finding, Verdict
 from handeye_tri.diagnose.images import blurred_views, image_findings
 from handeye_tri.diagnose.pose_pairs import assess_pose_pairs
 from handeye_tri.diagnose.session_causes import Evidence, session_causes, turn_findings
 from handeye_tri.diagnose.sides import unit_words
-from handeye_tri.errors import HandEyeError
+from handeye_tri.errors import DegenerateMotionError, HandEyeError
 from handeye_tri.hand_eye import (
     calibrate_hand_eye,
     solve_pose_pairs,
@@ -34,6 +35,28 @@ Floats = NDArray[np.float64]
 # A reading that calibrates is believed up to this chi2 per degree of freedom.
 _BELIEVED = 4.0
 _SHIFTS = {1: "after", -1: "before"}
+
+
+def uncalibrated_verdict(error: HandEyeError, findings: Sequence[Finding]) -> Verdict:
+    """What is left to say where calibration gave up: no gate can run.
+
+    It is CANNOT TELL where motions are too poor to determine what was asked for, as
+    nothing contradicts anything then, and FAIL otherwise.
+
+    Args:
+        error: What calibration gave up with.
+        findings: What :func:`why_uncalibrated` names.
+    """
+    poor = isinstance(error, DegenerateMotionError)
+    if findings:
+        poor = findings[0].code == "MOTION"
+    return Verdict(
+        "CANNOT TELL" if poor else "FAIL",
+        f"Not calibrated: {error}",
+        (),
+        "",
+        tuple(findings),
+    )
 
 
 def why_uncalibrated(
@@ -203,9 +226,11 @@ def _readings(session: Session, cameras: CameraCalibration) -> tuple[Finding, ..
     except HandEyeError:
         return ()
     factor = next(one.scale for one in readings if one.key == "scaled")
-    return tuple(
+    named = [
         replace(one, code="UNIT", cause=one.cause + unit_words(factor))
         if one.code == "SCALE"
         else one
         for one in verdict.findings
-    )
+    ]
+    # Bare pairs that contradict each other do so for one reason.
+    return (*named[:1], *(replace(one, follows=named[0].code) for one in named[1:]))

@@ -94,8 +94,9 @@ def _definitions() -> Json:
                 "remedy": _TEXT,
                 "stations": {"type": "array", "items": {"type": "integer"}},
                 "camera": _TEXT,
+                "follows": _TEXT,
             },
-            ("stations", "camera"),
+            ("stations", "camera", "follows"),
         ),
     }
 

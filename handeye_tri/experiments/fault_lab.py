@@ -15,8 +15,10 @@ from handeye_tri.arm import Arm
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
 from handeye_tri.diagnose import (
     Evidence,
+    Verdict,
     assess,
     session_causes,
+    uncalibrated_verdict,
     why_uncalibrated,
     with_causes,
 )
@@ -96,8 +98,9 @@ def judged(cell: RenderedCell, observed: Observed) -> dict[str, Any]:
     """Calibrate and judge as the stages do: outcome, codes, track over prediction.
 
     Returns:
-        "outcome"; "codes" and "text" of the findings in order; "ratio" of the held-out
-        track to its prediction, None where calibration gave up.
+        "outcome"; "codes" and "text" of the findings in order; "causes", the codes of
+        those that follow from no other one; "ratio" of the held-out track to its
+        prediction, None where calibration gave up.
     """
     session, limits = observed.session, cell.cell
     spread = float(np.radians(limits.plan.min_plane_spread_deg))
@@ -122,18 +125,17 @@ def judged(cell: RenderedCell, observed: Observed) -> dict[str, Any]:
         findings = why_uncalibrated(
             session, min_plane_spread=spread, joints=joints, edges=observed.edges
         )
-        return {
-            "outcome": "FAIL",
-            "codes": [one.code for one in findings],
-            "text": [f"{one.cause}; {one.evidence}" for one in findings]
-            or [str(error)],
-            "ratio": None,
-        }
+        return {**_told(uncalibrated_verdict(error, findings)), "ratio": None}
+    return {**_told(verdict), "ratio": track.rms / track.predicted_rms}
+
+
+def _told(verdict: Verdict) -> dict[str, Any]:
     return {
         "outcome": verdict.outcome,
         "codes": [one.code for one in verdict.findings],
-        "text": [f"{one.cause}; {one.evidence}" for one in verdict.findings],
-        "ratio": track.rms / track.predicted_rms,
+        "causes": [one.code for one in verdict.findings if not one.follows],
+        "text": [f"{one.cause}; {one.evidence}" for one in verdict.findings]
+        or [verdict.sentence],
     }
 
 

@@ -6,10 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from handeye_tri.adjustment import RobotParameters, joint_offsets, link_corrections
+from handeye_tri.adjustment import (
+    RobotParameters,
+    adjust,
+    joint_offsets,
+    link_corrections,
+)
 from handeye_tri.errors import InputError
+from handeye_tri.hand_eye import calibrate_hand_eye
 from handeye_tri.pipeline.run import Run
-from handeye_tri.records import HandEyeCalibration, Session
+from handeye_tri.records import CameraCalibration, HandEyeCalibration, Session
 from handeye_tri.se3 import SE3, se3_inverse
 
 
@@ -62,6 +68,21 @@ def turning_offsets(run: Run) -> RobotParameters:
         if arm.mechanism.joints[k].kind == "hinge"
     ]
     return joint_offsets(arm.joint_names, arm.jacobian(joints)).select(turning)
+
+
+def calibrated_cell(
+    run: Run, session: Session, cameras: CameraCalibration
+) -> HandEyeCalibration:
+    """The cell by the session's method, with those errors that it asks for.
+
+    Raises:
+        HandEyeError: it cannot be had from these data.
+    """
+    parameters = robot_parameters(run)
+    result = calibrate_hand_eye(session, cameras)
+    if run.method == "joint":
+        return adjust(session, result, robot_parameters=parameters)
+    return result
 
 
 def with_robot_applied(

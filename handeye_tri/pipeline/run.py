@@ -33,7 +33,7 @@ PLAN_SCHEMA = "handeye_tri.plan/1"
 TRUTH_SCHEMA = "handeye_tri.truth/1"
 CAMERAS_SCHEMA = "handeye_tri.cameras/1"
 HAND_EYE_SCHEMA = "handeye_tri.hand_eye/1"
-EVALUATION_SCHEMA = "handeye_tri.evaluation/1"
+EVALUATION_SCHEMA = "handeye_tri.evaluation/2"
 # Of what each stage writes. A file whose keys change gets a new number here, so that
 # a stage that wrote the old ones counts as stale.
 SCHEMAS = {

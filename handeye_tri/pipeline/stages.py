@@ -165,16 +165,11 @@ def _cameras(run: Run) -> tuple[list[str], str]:
 
 
 def _hand_eye(run: Run) -> tuple[list[str], str]:
-    from handeye_tri.adjustment import adjust
-    from handeye_tri.hand_eye import calibrate_hand_eye
-    from handeye_tri.pipeline.robot import robot_parameters
+    from handeye_tri.pipeline.robot import calibrated_cell, robot_parameters
 
-    session = run.session()
     parameters = robot_parameters(run)
     with explained(run):
-        result = calibrate_hand_eye(session, run.cameras())
-        if run.method == "joint":
-            result = adjust(session, result, robot_parameters=parameters)
+        result = calibrated_cell(run, run.session(), run.cameras())
     storage.write_json(
         run.folder.file("hand_eye.json"),
         {"schema": HAND_EYE_SCHEMA, **codec.hand_eye_to_json(result)},

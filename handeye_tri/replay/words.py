@@ -11,7 +11,7 @@ from handeye_tri.replay.steps import Slide
 from handeye_tri.replay.story import Story, worst_station
 from handeye_tri.triangle import VERTICES
 
-# rerun's names of the levels of a log, worst first.
+# rerun's names of the levels of a log.
 _LEVELS = {"error": "ERROR", "warning": "WARN", "note": "INFO"}
 
 
@@ -108,14 +108,18 @@ def _look_at(story: Story) -> str:
 
 
 def _findings(findings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What is wrong; what follows from it by its code alone, the log says it all."""
     lines: list[str] = []
-    order = list(_LEVELS)
-    for finding in sorted(findings, key=lambda one: order.index(one["severity"])):
-        lines += [
-            f"**{finding['code']}** {finding['cause']} ({finding['evidence']}). "
-            f"Do: {finding['remedy']}.",
-            "",
-        ]
+    for finding in findings:
+        if not finding["follows"]:
+            lines += [
+                f"**{finding['code']}** {finding['cause']} ({finding['evidence']}). "
+                f"Do: {finding['remedy']}.",
+                "",
+            ]
+    symptoms = dict.fromkeys(one["code"] for one in findings if one["follows"])
+    if symptoms:
+        lines += [f"What likely follows from it: {', '.join(symptoms)}.", ""]
     return lines
 
 
@@ -242,10 +246,12 @@ def log_lines(story: Story, evaluation: Mapping[str, Any]) -> list[LogLine]:
     """Findings at their stations, and how each station came out, in order."""
     lines = []
     for finding in evaluation["findings"]:
-        stations = finding.get("stations") or ()
-        text = (
-            f"{finding['code']} {finding['cause']} ({finding['evidence']}). "
-            f"Do: {finding['remedy']}."
+        stations = finding["stations"]
+        text = f"{finding['code']} {finding['cause']} ({finding['evidence']}). "
+        text += (
+            f"Likely from {finding['follows']}."
+            if finding["follows"]
+            else f"Do: {finding['remedy']}."
         )
         level = _LEVELS[finding["severity"]]
         if not stations:

@@ -105,7 +105,7 @@ def render_report(
         met=sum(gate["verdict"] != "bad" for gate in ran),
         ran=len(ran),
         gates=tables.gates_worst_first(evaluation["gates"]),
-        findings=tables.findings_worst_first(evaluation["findings"]),
+        findings=tables.findings_with_places(evaluation["findings"]),
         truth=any(row["error"] is not None for row in rows),
         motions=_motions(session, calibration, rows),
         lenses=[

@@ -76,15 +76,11 @@ def gates_worst_first(gates: Sequence[Mapping[str, Any]]) -> list[Mapping[str, A
     return sorted(gates, key=lambda gate: (_ORDER[gate["verdict"]], -gate["use"]))
 
 
-# Findings by severity.
-_SEVERITY = {"error": 0, "warning": 1, "note": 2}
-
-
-def findings_worst_first(findings: Sequence[Mapping[str, Any]]) -> list[Row]:
-    """Findings by severity, each with where it is in words ("" for everywhere)."""
+def findings_with_places(findings: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """Findings in their order, each with where it is in words ("" for everywhere)."""
     rows = []
-    for finding in sorted(findings, key=lambda one: _SEVERITY[one["severity"]]):
-        stations, camera = finding.get("stations") or (), finding.get("camera", "")
+    for finding in findings:
+        stations, camera = finding["stations"], finding["camera"]
         where = [f"camera {camera}"] if camera else []
         if stations:
             word = "station" if len(stations) == 1 else "stations"

@@ -9,7 +9,7 @@ from wrong_sessions import geometry, moved, observed, told, with_views
 
 from handeye_tri.adjustment import joint_offsets
 from handeye_tri.diagnose import with_causes
-from handeye_tri.diagnose.gates import Finding, Verdict
+from handeye_tri.diagnose.gates import Finding, Verdict, prediction_gate
 from handeye_tri.se3 import SE3, se3_exp
 from handeye_tri.triangle import TriangleRig
 
@@ -225,12 +225,58 @@ def test_noise_and_missing_markers_are_poor_detection():
     assert "7 of 168 markers missing" in finding.evidence
 
 
+def test_what_single_stations_are_off_beside_a_late_image_follows_from_it():
+    """The way to the next station is not even: stations differ in where they are."""
+    cell = geometry(4)
+    reported = np.array([s.base_from_flange.matrix for s in cell.stations])
+    rng = np.random.default_rng(8)
+    steps = [
+        share * (SE3(a).inverse() @ SE3(b)).log()
+        for a, b, share in zip(
+            reported[:-1],
+            reported[1:],
+            np.where(rng.random(len(reported) - 1) < 0.1, 0.05, 0.01),
+            strict=True,
+        )
+    ]
+    session = observed(4, at_poses(cell, reported @ se3_exp([*steps, np.zeros(6)])))
+    first, *others = told(replace(session, stations=cell.stations))
+    assert (first.code, first.follows) == ("CLOCK_OFFSET", "")
+    assert {one.code for one in others} <= {"POSE", "TURN_ANGLE", "DETECTION"}
+    assert others
+    assert {one.follows for one in others} == {"CLOCK_OFFSET"}
+
+
+TRACK = Finding("TRACK", "", "", "error", "")
+
+
 @pytest.mark.parametrize(
     ("severity", "outcome"), [("error", "FAIL"), ("warning", "PASS")]
 )
 def test_what_concerns_the_whole_session_is_not_passed(severity, outcome):
-    verdict = Verdict("PASS", "fine", (), "-", (Finding("TRACK", "", "", "error", ""),))
+    verdict = Verdict("PASS", "fine", (prediction_gate(1.2),), "-", (TRACK,))
     cause = Finding("RIG_SLIPPED", "the rig moved", "by 2 mm", severity, "tighten it")
     found = with_causes(verdict, [cause])
     assert found.outcome == outcome
-    assert codes(found.findings) == ["RIG_SLIPPED", "TRACK"]
+    assert [(one.code, one.follows) for one in found.findings] == [
+        ("RIG_SLIPPED", ""),
+        ("TRACK", "RIG_SLIPPED"),
+    ]
+    holds = "the result holds: held-out track / predicted 1.20 (limit 2.00)"
+    assert (holds in found.findings[0].evidence) == (outcome == "PASS")
+
+
+def test_errors_stand_before_warnings_and_both_before_what_follows():
+    causes = [
+        Finding("BLUR", "", "", "warning", ""),
+        Finding("POSE", "", "", "error", "", follows="BLUR"),
+        Finding("CAMERA_MOVED", "", "", "error", ""),
+    ]
+    found = with_causes(Verdict("FAIL", "", (), "-", (TRACK,)), causes).findings
+    assert codes(found) == ["CAMERA_MOVED", "BLUR", "POSE", "TRACK"]
+    assert [one.follows for one in found] == ["", "", "BLUR", "CAMERA_MOVED"]
+
+
+def test_without_causes_the_verdict_stays_as_it_is():
+    verdict = Verdict("FAIL", "", (), "-", (TRACK,))
+    assert with_causes(verdict, []) is verdict

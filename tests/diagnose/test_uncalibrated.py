@@ -8,8 +8,8 @@ from wrong_sessions import geometry, observed
 
 from handeye_tri.adjustment import adjust
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
-from handeye_tri.diagnose import why_uncalibrated
-from handeye_tri.errors import HandEyeError
+from handeye_tri.diagnose import Finding, uncalibrated_verdict, why_uncalibrated
+from handeye_tri.errors import ConvergenceError, DegenerateMotionError, HandEyeError
 from handeye_tri.hand_eye import calibrate_hand_eye
 from handeye_tri.se3 import SE3
 from handeye_tri.triangle import TriangleRig
@@ -95,3 +95,21 @@ def test_half_turns_that_are_all_alike():
     session = observed(4, replace(cell, stations=tuple(stations)))
     finding = why_uncalibrated(session, min_plane_spread=float(np.radians(20.0)))[0]
     assert finding.code == "MOTION"
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "outcome"),
+    [
+        (DegenerateMotionError, "MOTION", "CANNOT TELL"),
+        (DegenerateMotionError, "READING", "FAIL"),
+        (ConvergenceError, "MOTION", "CANNOT TELL"),
+        (DegenerateMotionError, None, "CANNOT TELL"),
+        (ConvergenceError, None, "FAIL"),
+    ],
+)
+def test_only_poor_motions_leave_open_whether_something_is_wrong(error, code, outcome):
+    findings = [] if code is None else [Finding(code, "", "", "error", "")]
+    verdict = uncalibrated_verdict(error("planes 2 deg apart"), findings)
+    assert verdict.outcome == outcome
+    assert verdict.sentence == "Not calibrated: planes 2 deg apart"
+    assert verdict.findings == tuple(findings)

@@ -62,6 +62,62 @@ def test_an_uncalibrated_session_says_what_to_run(capsys, tmp_path):
     assert f"handeye-tri calibrate {run.folder.path}" in err
 
 
+def change_plan(run, change):
+    """Have another plan.json, with the hash in order, and nothing calibrated."""
+    data = storage.read_json(run.folder.file("plan.json"), "handeye_tri.plan/1")
+    change(data)
+    storage.write_json(run.folder.file("plan.json"), data)
+    for stage in ("cameras", "hand_eye", "evaluate"):
+        del run.folder.header["stages"][stage]
+    record_again(run, "plan")
+
+
+def in_millimetres(data):
+    for station in data["stations"]:
+        place = station["base_from_flange"]["translation_m"]
+        station["base_from_flange"]["translation_m"] = [1e3 * x for x in place]
+
+
+def test_a_session_that_does_not_calibrate_says_why(capsys, tmp_path):
+    run = drawn_session(tmp_path)
+    change_plan(run, in_millimetres)
+    before = digests(run.folder.path)
+    code, out, err = call(capsys, "check", run.folder.path)
+    assert (code, err) == (3, "")
+    first, second, *_ = out.splitlines()
+    assert first == "VERDICT  FAIL      SIMULATED, not calibrated, no gate run"
+    assert second.startswith("  Not calibrated: ")
+    assert "\n  UNIT: both sides disagree on lengths: robot translations are " in out
+    assert "\n    Do: " in out
+    assert "\n    RESIDUAL, likely from UNIT: " in out
+    told = out[: out.index("\nFILES")]
+    assert max(map(len, told.splitlines())) <= 88
+    code, out, _ = call(capsys, "check", run.folder.path, "--json")
+    checked = json.loads(out)
+    assert (code, checked["verdict"], checked["track"]) == (3, "FAIL", None)
+    assert [one["code"] for one in checked["findings"]] == ["UNIT", "RESIDUAL"]
+    assert digests(run.folder.path) == before
+
+
+def test_a_session_without_half_turns_leaves_with_4(capsys, tmp_path):
+    run = drawn_session(tmp_path)
+    change_plan(run, lambda data: data["half_turns"].clear())
+    code, out, err = call(capsys, "check", run.folder.path)
+    assert (code, err) == (4, "")
+    assert out.startswith("VERDICT  CANNOT TELL      SIMULATED, not calibrated")
+    assert "the session has no half_turns" in out
+
+
+def test_what_nobody_could_calibrate_is_no_usable_input(capsys, tmp_path):
+    run = drawn_session(tmp_path)
+    del run.folder.header["stages"]["hand_eye"]
+    run.folder.header |= {"method": "separate", "robot_errors": ["joint-offsets"]}
+    run.folder.save()
+    code, out, err = call(capsys, "check", run.folder.path)
+    assert (code, out) == (2, "")
+    assert err.startswith("error: --robot joint-offsets needs --method joint")
+
+
 def record_again(run, stage):
     """Take a stage's files as they are, with the inputs that were recorded."""
     entry = run.folder.header["stages"][stage]

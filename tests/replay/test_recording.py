@@ -3,7 +3,7 @@
 import io
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from finished_session import (
 from PIL import Image
 from rerun.chunk import RrdReader
 
+from handeye_tri.diagnose import Finding
 from handeye_tri.errors import InputError, StorageError
 from handeye_tri.records import TrackEvaluation
 from handeye_tri.replay import SolverStep, write_recording
@@ -122,13 +123,10 @@ def test_what_is_first_on_screen_is_the_worst_used_station(recording):
 
 
 def test_findings_stand_in_the_log_at_their_stations(tmp_path):
-    about = {"code": "SLIP", "cause": "the rig slipped", "evidence": "1.2 mm"}
-    about |= {"remedy": "tighten it", "camera": ""}
-    findings = [
-        {**about, "severity": "error", "stations": (4, 6)},
-        {**about, "severity": "note", "code": "FEW"},
-    ]
+    slip = Finding("SLIP", "the rig slipped", "1.2 mm", "error", "tighten it", (4, 6))
+    few = replace(slip, code="FEW", severity="note", stations=(), follows="SLIP")
     path = tmp_path / "replay.rrd"
+    findings = [asdict(slip), asdict(few)]
     write(path, evaluation={**evaluation(finished()), "findings": findings})
     log = {}
     for chunk in RrdReader(path).stream().filter(content="/log").to_chunks():
@@ -146,7 +144,8 @@ def test_findings_stand_in_the_log_at_their_stations(tmp_path):
     assert told_ in log[4, "ERROR"]
     assert told_ in log[6, "ERROR"]
     assert (5, "ERROR") not in log
-    assert any(text.startswith("All stations: FEW") for text in log[0, "INFO"])
+    (text,) = (text for text in log[0, "INFO"] if text.startswith("All stations: FEW"))
+    assert text.endswith("(1.2 mm). Likely from SLIP.")
     # And each station's worst marker.
     marker, gap = tell(*told()).worst(5)
     assert f"used: {marker} {gap:.3f} mm" in log[5, "INFO"]

@@ -177,8 +177,9 @@ def test_the_verdict_names_station_gates_and_source():
         "simulated": False,
         "gates": [{"verdict": "bad"}, {"verdict": "good"}, {"verdict": "not run"}],
         "findings": [
-            {"code": "LOOP", "cause": "noise", "evidence": "1.9", "remedy": "look"}
-            | {"severity": "error"}
+            {"code": "SLIP", "cause": "slid", "evidence": "2 mm", "remedy": "look"}
+            | {"follows": ""},
+            {"code": "LOOP", "follows": "SLIP"},
         ],
         "track": {
             **{key: 1.5 for key in ("mean_mm", "rms_mm", "max_mm")},
@@ -188,7 +189,10 @@ def test_the_verdict_names_station_gates_and_source():
     done = finished()
     text = verdict_markdown(evaluation, story_of(done), done.track)
     # The verdict and what is wrong come before the numbers.
-    assert text.startswith("# FAIL\nWithin 2 mm.\n\n**LOOP** noise (1.9). Do: look.")
+    assert text.startswith(
+        "# FAIL\nWithin 2 mm.\n\n**SLIP** slid (2 mm). Do: look.\n\n"
+        "What likely follows from it: LOOP.\n"
+    )
     worst = worst_station(done.track)
     for part in ("1 of 2 gates met, 1 not run", "REAL", f"worst at station {worst}"):
         assert part in text

@@ -1,13 +1,14 @@
 """The report's page: order, words, digits, escaping; no need of a browser."""
 
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from finished_session import evaluation, finished, photograph
 
+from handeye_tri.diagnose import Finding
 from handeye_tri.report import Origin, figures, geometry, render_report
 from handeye_tri.report.tables import gates_worst_first, number, quantities
 
@@ -125,32 +126,29 @@ def test_the_strip_says_simulated_or_real_and_the_figures(html, undrawn):
 
 @pytest.mark.parametrize("outcome", ["FAIL", "CANNOT TELL"])
 def test_without_a_pass_the_failure_leads_and_numbers_are_warned_of(outcome, undrawn):
-    finding = {
-        "code": "LOOP",
-        "cause": "robot and cameras disagree",
-        "evidence": "4.2 (limit 1.6)",
-        "severity": "error",
-        "remedy": "check the pairing",
-    }
-    html = page(changes={"verdict": outcome, "findings": [finding]})
+    finding = Finding(
+        *("LOOP", "robot and cameras disagree", "4.2 (limit 1.6)"),
+        *("error", "check the pairing"),
+    )
+    html = page(changes={"verdict": outcome, "findings": [asdict(finding)]})
     text = text_of(html)
     assert f"The verdict is {outcome}: do not use these numbers." in text
     assert text.index("Do: check the pairing.") < text.index("The numbers to use")
     assert f'class="verdict {outcome.split()[0]}"' in html
 
 
-def test_findings_are_worst_first_and_say_where(undrawn):
-    told = {"cause": "c", "evidence": "e", "remedy": "r"}
+def test_findings_say_where_and_what_follows_from_them_comes_last(undrawn):
     findings = [
-        {**told, "code": "NOTED", "severity": "note"},
-        {**told, "code": "WRONG", "severity": "error", "stations": [4, 6]},
-        {**told, "code": "WARNED", "severity": "warning", "camera": "left"},
+        Finding("SLIP", "c", "e", "warning", "r", (4, 6)),
+        Finding("LOOP", "l", "4.2", "error", "mend", follows="SLIP"),
+        Finding("POOR", "p", "e", "warning", "r", camera="left"),
     ]
-    text = text_of(page(changes={"findings": findings}))
-    assert text.index("WRONG c") < text.index("WARNED c") < text.index("NOTED c")
-    assert "(stations 4, 6)" in text
-    assert "(camera left)" in text
-    assert "worst first: WRONG, WARNED, NOTED" in text
+    text = text_of(page(changes={"findings": [asdict(one) for one in findings]}))
+    assert "SLIP c (stations 4, 6)" in text
+    assert "POOR p (camera left)" in text
+    assert text.index("POOR p") < text.index("LOOP likely follows from SLIP: l; 4.2.")
+    assert "Do: mend" not in text
+    assert "SLIP, POOR; what follows from them: LOOP" in text
 
 
 def test_every_estimated_quantity_is_there_with_its_sigma(html):
