@@ -23,6 +23,9 @@ AXES: tuple[Axis, ...] = get_args(Axis)
 VERTICES = ("A", "B", "C")
 # The two vertices on each edge, as rows of TriangleRig.points.
 EDGES: dict[str, tuple[int, int]] = {"AB": (0, 1), "BC": (1, 2), "CA": (2, 0)}
+# The least cosine of the angle by which the triangle is seen aslant, for its markers to
+# be told from other things: 66 degrees.
+MIN_FACING = 0.4
 # Flatter than this, the three points are as good as collinear.
 _MIN_ANGLE = np.radians(1.0)
 
@@ -200,3 +203,20 @@ def frame_by_markers(markers: Floats) -> Floats:
     by_frame[1, 0, 6] = by_frame[2, 0, 7] = by_frame[2, 1, 8] = 1.0
     by_shape = (frame.rotation @ by_frame).reshape(9, 9)
     return np.asarray(np.linalg.inv(by_shape)[:6])
+
+
+def apparent_scales(pixels: Floats, sides: Floats) -> Floats:
+    """How large a triangle appears, the longer way and the shorter (weak perspective).
+
+    Args:
+        pixels: Of A, B, C, shape (..., 3, 2).
+        sides: AB and AC in the triangle's plane, shape (..., 2, 2), metres.
+
+    Returns:
+        Shape (..., 2), px per metre; the second over the first is the cosine of the
+        angle by which the triangle is seen aslant.
+    """
+    seen = pixels[..., 1:, :] - pixels[..., :1, :]
+    return np.asarray(
+        np.linalg.svd(np.linalg.solve(sides, seen), compute_uv=False), dtype=float
+    )

@@ -483,6 +483,16 @@ def test_the_triangle_tells_a_marker_from_a_second_thing_of_its_looks(
     assert np.abs(found.pixels - centres).max() < 0.1
 
 
+def test_a_triangle_seen_nearly_from_its_edge_is_left_and_said_to_be_so() -> None:
+    canvas = Canvas(320, 240, 120)
+    centres = (TRIANGLE - TRIANGLE.mean(axis=0)) * [900.0, 270.0] + [160, 120]
+    for centre, colour in zip(centres, PURE, strict=True):
+        canvas.disc(255 * colour, centre, 7.2)
+    known = MarkerSpec("colour", PURE, EQUAL, TRIANGLE)
+    found = detect_markers(canvas.image(np.random.default_rng(1)), known)
+    assert found.reasons == ("aslant",) * 3
+
+
 def test_a_lone_thing_too_far_from_the_others_is_not_taken() -> None:
     """A is hidden; a red disc lies where A cannot be."""
     canvas = Canvas(320, 240, 120)

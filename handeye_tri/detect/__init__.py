@@ -121,7 +121,7 @@ def _measured(
             for spot, reason in zip(spots, outlines.reasons, strict=True)
             if reason is not None and spot.markers == (marker,)
         ]
-        why.append("ambiguous" if unclear else (*rejected, "no_candidate")[0])
+        why.append(unclear or (*rejected, "no_candidate")[0])
     return _detection([None if k is None else good[k] for k in named], why, outlines)
 
 

@@ -8,8 +8,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.detect.markers import MarkerSpec
+from handeye_tri.detect.markers import MarkerSpec, Reason
 from handeye_tri.records import Floats
+from handeye_tri.triangle import MIN_FACING, apparent_scales
 
 Indices = NDArray[np.intp]
 
@@ -22,8 +23,6 @@ _MIN_MARGIN = 0.1
 # By how much the triangle's size may differ from what the markers' sizes say, as a
 # logarithm: perspective makes near markers larger and near sides longer.
 _MAX_MISMATCH = 0.2
-# The least cosine of the angle by which the triangle is seen aslant: 66 degrees.
-_MIN_FACING = 0.4
 
 
 def assign(
@@ -32,7 +31,7 @@ def assign(
     radii_px: Floats,
     markers: MarkerSpec,
     excess: Floats,
-) -> tuple[list[int | None], bool]:
+) -> tuple[list[int | None], Reason | None]:
     """Name spots as markers, as many markers as can be.
 
     Sizes in the image are radius over depth. The markers' depths are similar, so
@@ -50,11 +49,12 @@ def assign(
             it must be much the same for all three.
 
     Returns:
-        For each marker its spot or None; whether spots remained unnamed since they
-        could be named in more than one way.
+        For each marker its spot or None; why spots remained unnamed: "ambiguous",
+        they could be named in more than one way, "aslant", they would be a triangle
+        seen nearly from its edge; None where nothing else could be a marker.
     """
     ratio = np.log(radii_px)[:, None] - np.log(markers.radii)
-    unclear = False
+    unclear: Reason | None = None
     for count in (3, 2, 1):
         ways: list[tuple[float, tuple[int, ...], Indices]] = []
         for chosen in combinations(range(3), count):
@@ -67,15 +67,18 @@ def assign(
             if markers.points is not None and count > 1:
                 scale = np.exp(ratios.mean(axis=1))
                 points = markers.points[list(chosen)]
-                mismatch = _mismatch(centres[spots], points, scale)
+                mismatch, aslant = _mismatch(centres[spots], points, scale)
                 fits &= mismatch < _MAX_MISMATCH
+                if count == 3 and (fits & aslant).any():
+                    unclear = "aslant"
+                fits &= ~aslant
                 cost = spread + mismatch
             ways += [(float(cost[k]), chosen, spots[k]) for k in np.flatnonzero(fits)]
         ways.sort(key=lambda way: way[0])
         if not ways:
             continue
         if len(ways) > 1 and ways[1][0] < ways[0][0] + _MIN_MARGIN:
-            unclear = True
+            unclear = unclear or "ambiguous"
             continue
         named: list[int | None] = [None] * 3
         for marker, spot in zip(ways[0][1], ways[0][2], strict=True):
@@ -93,7 +96,9 @@ def _choices(allowed: Sequence[tuple[int, ...]], markers: Sequence[int]) -> Indi
     return np.asarray(spots[(ordered[:, 1:] != ordered[:, :-1]).all(axis=1)])
 
 
-def _mismatch(centres: Floats, points: Floats, scale: Floats) -> Floats:
+def _mismatch(
+    centres: Floats, points: Floats, scale: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
     """How badly centres fit as images of points, as a logarithm of lengths.
 
     Args:
@@ -102,18 +107,14 @@ def _mismatch(centres: Floats, points: Floats, scale: Floats) -> Floats:
         scale: Of the image by the markers' sizes, shape (w,), px per metre.
 
     Returns:
-        Shape (w,); infinite where the triangle would be seen nearly from its edge.
+        Shape (w,); and where the triangle would be seen nearly from its edge.
     """
-    sides = centres[:, 1:] - centres[:, :1]
     true = points[1:] - points[:1]
     if len(true) == 1:
-        longest = np.linalg.norm(sides[:, 0], axis=1) / np.linalg.norm(true)
-        size = np.log(longest / scale)
+        side = np.linalg.norm(centres[:, 1] - centres[:, 0], axis=1)
+        size = np.log(side / np.linalg.norm(true) / scale)
         # A side that lies along the line of sight is shorter, but not by so much.
-        return np.asarray(
-            np.where(size > np.log(_MIN_FACING), np.maximum(size, 0.0), np.inf)
-        )
-    sizes = np.linalg.svd(np.linalg.solve(true, sides), compute_uv=False)
-    long, short = sizes[:, 0], sizes[:, 1]
+        return np.maximum(size, 0.0), np.asarray(size <= np.log(MIN_FACING))
+    long, short = apparent_scales(centres, true).T
     off = np.abs(np.log(np.maximum(long, 1e-9) / scale))
-    return np.asarray(np.where(short > _MIN_FACING * long, off, np.inf))
+    return np.asarray(off), np.asarray(short <= MIN_FACING * long)

@@ -15,7 +15,13 @@ if TYPE_CHECKING:
 
 Identity = Literal["colour", "radius"]
 Reason = Literal[
-    "no_candidate", "at_border", "occluded", "not_round", "no_fit", "ambiguous"
+    "no_candidate",
+    "at_border",
+    "occluded",
+    "not_round",
+    "no_fit",
+    "ambiguous",
+    "aslant",
 ]
 
 # Colours nearer to grey than this, or to each other in hue, are not told apart.
@@ -130,7 +136,7 @@ class Detection:
             nothing of its kind is in the image; "at_border": the image cuts it off;
             "occluded": too little of its outline shows; "not_round": the outline is
             no ellipse; "no_fit": the fit did not settle; "ambiguous": more than one
-            thing could be it.
+            thing could be it; "aslant": the triangle is seen nearly from its edge.
         edges: How wide the edge is across direction t: its variance is mean + cos(2t)
             c + sin(2t) s; (mean, c, s) of A, B, C, shape (3, 3), px^2; NaN = not found.
     """

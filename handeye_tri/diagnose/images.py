@@ -6,9 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.diagnose.gates import Finding
+from handeye_tri.diagnose.loop import Fit, Loop
 from handeye_tri.records import Session
+from handeye_tri.triangle import MIN_FACING, apparent_scales
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 # An edge that is drawn out over a length L has a variance of L^2 / 12 more across it.
 _PER_LENGTH = 12.0
@@ -59,15 +62,35 @@ def blurred_views(session: Session, edges: Floats | None) -> list[tuple[int, int
     return [(int(i), int(j)) for i, j in np.argwhere(length > np.fmax(limit, chance))]
 
 
+def views_due(loop: Loop, fit: Fit) -> Bools:
+    """Views that hold all markers, and not nearly from the triangle's edge, (m, n).
+
+    What stands before a marker is not looked for.
+    """
+    pixels = loop.predicted(fit)
+    sizes = np.array([info.image_size for info in loop.session.cameras])
+    inside = (pixels > 0.0) & (pixels < sizes[:, None, None] - 1.0)
+    due: Bools = np.asarray(inside.all(axis=(2, 3)))
+    markers = loop.local(fit)[due]
+    _, sides = np.linalg.qr((markers[:, 1:] - markers[:, :1]).mT)
+    long, short = apparent_scales(pixels[due], sides.mT).T
+    due[due] = short > MIN_FACING * long
+    return due
+
+
 def image_findings(
-    session: Session, blurred: list[tuple[int, int]], edges: Floats | None
+    session: Session,
+    blurred: list[tuple[int, int]],
+    edges: Floats | None,
+    due: Bools | None = None,
 ) -> list[Finding]:
-    """Findings that need no geometry.
+    """What is wrong with the images.
 
     Args:
         session: What was detected.
         blurred: What :func:`blurred_views` found.
         edges: What it found it in, (m, n, 3, 3), px^2; None where not measured.
+        due: Views in which all markers should be found, (m, n); None for all.
     """
     names = [info.name for info in session.cameras]
     findings = []
@@ -91,29 +114,34 @@ def image_findings(
                 names[cameras.pop()] if len(cameras) == 1 else "",
             )
         )
-    poor = _poor_detection(session, names)
+    poor = _poor_detection(session, names, due)
     return findings if poor is None else [*findings, poor]
 
 
-def _poor_detection(session: Session, names: list[str]) -> Finding | None:
-    seen = np.isfinite(session.pixels).all(axis=-1)
-    taken = seen.any(axis=-1)
+def _poor_detection(
+    session: Session, names: list[str], due: Bools | None
+) -> Finding | None:
+    seen: Bools = np.asarray(np.isfinite(session.pixels).all(axis=-1))
+    taken: Bools = np.asarray(seen.any(axis=-1))
     variance = np.trace(session.pixel_covariance, axis1=-2, axis2=-1) / 2.0
     filled = np.where(seen, variance, 0.0).sum(axis=-1)
     sigma = np.sqrt(filled / np.maximum(seen.sum(axis=-1), 1))
     usual = float(np.median(sigma[taken])) if taken.any() else 0.0
     limit = min(_POOR_SIGMA, max(_POOR_RATIO * usual, 0.5 * _POOR_SIGMA))
     poor = np.argwhere(taken & (sigma > limit))
-    missing = int((~seen).sum())
-    if not len(poor) and missing <= _MISSING * seen.size:
+    if due is None:
+        due = np.ones(taken.shape, dtype=bool)
+    due = due | taken
+    missing, markers = int((~seen[due]).sum()), seen[due].size
+    if not len(poor) and missing <= _MISSING * markers:
         return None
-    lacking = np.argwhere(~seen.all(axis=-1))
+    lacking = np.argwhere(due & ~seen.all(axis=-1))
     views = {(int(i), int(j)) for i, j in (*poor, *lacking)}
     cameras = {i for i, _ in views}
     return Finding(
         "DETECTION",
         "markers are found poorly, or not at all",
-        f"{missing} of {seen.size} markers missing; sigma {usual:.3f} px at the median "
+        f"{missing} of {markers} markers missing; sigma {usual:.3f} px at the median "
         f"view, {sigma.max():.3f} at the worst, above {limit:.2f} in {len(poor)} views",
         "warning",
         "more and even light, focus, larger or more saturated markers, less gain; "

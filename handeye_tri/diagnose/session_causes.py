@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from handeye_tri.adjustment import RobotParameters
 from handeye_tri.diagnose.causes import best_cause, possible_causes, turned_angle
 from handeye_tri.diagnose.gates import PREDICTION_GATE, Finding, Verdict
-from handeye_tri.diagnose.images import blurred_views, image_findings
+from handeye_tri.diagnose.images import blurred_views, image_findings, views_due
 from handeye_tri.diagnose.loop import Cause, Fit, Loop
 from handeye_tri.diagnose.odd_views import OddView, odd_views
 from handeye_tri.diagnose.sides import side_finding
@@ -90,7 +90,7 @@ def session_causes(evidence: Evidence) -> tuple[Finding, ...]:
         fit = after
     names = [info.name for info in session.cameras]
     findings = [
-        *image_findings(session, blurred, evidence.edges),
+        *image_findings(session, blurred, evidence.edges, views_due(loop, fit)),
         *_odd_findings(odd, names),
         *turn_findings(session, {c.station for c, _, _ in found if c.kind == "pose"}),
         *_cause_findings(found, names, "BLUR" if blurred else ""),

@@ -225,6 +225,27 @@ def test_noise_and_missing_markers_are_poor_detection():
     assert "7 of 168 markers missing" in finding.evidence
 
 
+@pytest.mark.parametrize("way", ["beside the image", "aslant", "in the image"])
+def test_a_camera_that_does_not_see_the_rig_detects_nothing_poorly(way):
+    """Markers of both cameras lack at four stations, where it is no wonder or is."""
+    session = observed(2)
+    poses = session.base_from_flange.copy()
+    if way == "beside the image":
+        poses[-4:, :3, 3] += [0.0, 0.0, 2.0]
+    elif way == "aslant":
+        left, right = (place.translation for place in geometry(2).base_from_camera)
+        for pose in poses[-4:]:
+            across = np.cross(right - left, pose[:3, 3] - left)
+            pose[:3, :3] = np.linalg.qr(np.c_[across, np.eye(3)[:, :2]])[0][
+                :, [1, 2, 0]
+            ]
+            pose[:3, 1] *= np.linalg.det(pose[:3, :3])
+    pixels = session.pixels.copy()
+    pixels[:, -4:] = np.nan
+    found = told(at_poses(replace(session, pixels=pixels), poses))
+    assert codes(found) == (["DETECTION"] if way == "in the image" else [])
+
+
 def test_what_single_stations_are_off_beside_a_late_image_follows_from_it():
     """The way to the next station is not even: stations differ in where they are."""
     cell = geometry(4)
