@@ -221,7 +221,8 @@ def _cause_findings(
 
     How far a robot had got when its images were taken, or how its joints are off, is
     known by a model of few numbers. What single stations are off beside such a cause is
-    what the model leaves of it, more likely than a further cause.
+    what the model leaves of it, more likely than a further cause. Beside images of
+    another time so is a step: there every station is off, each by another motion.
 
     Args:
         found: The causes.
@@ -245,7 +246,7 @@ def _cause_findings(
     findings = []
     for kind, group in kinds.items():
         finding = makers[kind](group, names)
-        if kind in _SINGLE and moving:
+        if moving and (kind in _SINGLE or moving == "CLOCK_OFFSET"):
             finding = replace(finding, follows=moving)
         elif kind in _EVERYWHERE:
             moving = finding.code

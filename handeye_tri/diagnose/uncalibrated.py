@@ -14,6 +14,7 @@ from handeye_tri.calibrate_cameras import (
     calibrate_cameras_general,
     calibrate_session_cameras,
 )
+from handeye_tri.diagnose.best_half_turns import without_bad_half_turns
 from handeye_tri.diagnose.gates import Finding, Verdict
 from handeye_tri.diagnose.images import blurred_views, image_findings
 from handeye_tri.diagnose.pose_pairs import assess_pose_pairs
@@ -72,8 +73,8 @@ def why_uncalibrated(
     readings of bare pose pairs are solved: inverted, shifted, in another unit. Where
     they do not, images that belong to the next or the last station, or markers that
     bear each other's names everywhere, would make half-turns that are none. Last, the
-    cameras are calibrated as if the motions were general ones, and the causes of
-    :func:`session_causes` compete on that.
+    cameras are calibrated from those half-turns that agree, or else as if the motions
+    were general ones, and the causes of :func:`session_causes` compete on that.
 
     Args:
         session: What was detected.
@@ -124,9 +125,26 @@ def why_uncalibrated(
                     "correct rig.marker_colours or marker_radii_mm, or the sides",
                 ),
             )
-    return _on_general_motions(session, joints) or tuple(
-        turn_findings(session, frozenset())
+    return (
+        _on_the_best_half_turns(session, joints, edges)
+        or _on_general_motions(session, joints)
+        or tuple(turn_findings(session, frozenset()))
     )
+
+
+def _on_the_best_half_turns(
+    session: Session, joints: RobotParameters | None, edges: Floats | None
+) -> tuple[Finding, ...]:
+    """What is wrong, where more half-turns are bad than calibration leaves out."""
+    lost = without_bad_half_turns(session)
+    if lost is None:
+        return ()
+    used = session.without(lost)
+    try:
+        calibration = calibrate_hand_eye(used, calibrate_session_cameras(used))
+        return session_causes(Evidence(session, calibration, lost, joints, edges))
+    except HandEyeError:
+        return ()
 
 
 def _on_general_motions(

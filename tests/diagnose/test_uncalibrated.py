@@ -82,6 +82,23 @@ def test_markers_named_wrongly_everywhere():
     assert "A, B, C are B, A, C" in finding.cause
 
 
+@pytest.mark.parametrize(
+    ("code", "order"), [("STALE", [0, 1, 2]), ("LABELS", [1, 0, 2])]
+)
+def test_more_bad_views_of_a_camera_than_calibration_leaves_out(code, order):
+    session = observed(5)
+    pixels = session.pixels.copy()
+    bad = sorted(turn.after for turn in session.half_turns[1::3])
+    assert len(bad) > len(session.half_turns) / 4
+    for station in bad:
+        # Of the half-turn before: that of its own station before would be no turn.
+        shown = station - 2 * (code == "STALE")
+        pixels[1, station] = session.pixels[1, shown, order]
+    finding = reason(replace(session, pixels=pixels))
+    assert (finding.code, finding.camera) == (code, session.cameras[1].name)
+    assert finding.stations == tuple(bad)
+
+
 def test_half_turns_that_are_all_alike():
     cell = geometry(4)
     stations = list(cell.stations)
