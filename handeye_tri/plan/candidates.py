@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,11 @@ _BATCH = 400
 _MOST_POSES = 12000
 # A cell in which none of this many poses passes has no plan.
 _HOPELESS = 1200
+# Starts of inverse kinematics: to learn whether a pose is reached, and by what.
 _STARTS = 9
+_MORE_STARTS = 48
+# Solutions closer than this in every joint are one, rad or m.
+_SAME_JOINTS = 1e-4
 # The sphere to see whole is larger than the marker by this factor: blur and the
 # detector's window reach beyond the outline.
 SIGHT_MARGIN = 1.15
@@ -118,7 +122,8 @@ class CandidateSearch:
         Args:
             wanted: How many.
             turns: Whether a place is that of a half-turn (else of one station).
-            solutions: How many free solutions of each to look for.
+            solutions: How many free solutions of each to look for; with more than
+                one, inverse kinematics searches longer.
 
         Returns:
             Free solutions of up to ``wanted`` places, in the order drawn.
@@ -128,7 +133,8 @@ class CandidateSearch:
             if not found and self.drawn >= _HOPELESS:
                 break
             for prospect in self._solved(turns):
-                free = self.free(prospect, solutions)
+                wide = self.widened(prospect) if solutions > 1 else prospect
+                free = self.free(wide, solutions)
                 if free:
                     found.append(free)
                 if len(found) == wanted:
@@ -155,6 +161,19 @@ class CandidateSearch:
             if progress is not None:
                 progress(min(len(found), wanted))
         return found[:wanted]
+
+    def widened(self, prospect: Prospect) -> Prospect:
+        """The same place with the solutions that a longer search adds to its own."""
+        arm, known = self._arm, prospect.joints
+        (found,) = arm.inverse(
+            prospect.base_from_flange[:1], self._rng, starts=_MORE_STARTS
+        ).joints
+        gaps = np.abs(found[:, None] - known[None, :, 0]).max(axis=-1)
+        new = found[(gaps > _SAME_JOINTS).all(axis=1)]
+        if len(new) == 0:
+            return prospect
+        added = new[:, None] if known.shape[1] == 1 else self._turned([new])[0]
+        return replace(prospect, joints=np.concatenate([known, added]))
 
     def _solved(self, turns: bool) -> list[Prospect]:
         """Those of a batch of poses that pass the checks without solids."""

@@ -32,7 +32,7 @@ _LARGEST_POOL = 1000
 # Selections that are tried before a cell is given up.
 _SELECTIONS = 6
 # Solutions of a place that the order may choose from.
-_SOLUTIONS = 6
+_SOLUTIONS = 8
 
 
 def plan_motions(
@@ -267,7 +267,7 @@ class _Planner:
             if usual is None or len(held_out) < self.held_out:
                 break
             self._check_spread(pool, usual)
-            places = [search.free(pool[k], _SOLUTIONS) for k in usual]
+            places = [search.free(search.widened(pool[k]), _SOLUTIONS) for k in usual]
             places += held_out[: self.held_out]
             joints = [[c.joints for c in solutions] for solutions in places]
             route = self.route.drive(joints, self.visited.joints)
