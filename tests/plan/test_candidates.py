@@ -59,6 +59,25 @@ def test_a_wrist_without_room_turns_over_instead():
         assert np.prod(candidate.joints[:, 4]) < 0
 
 
+@pytest.mark.parametrize("turns", [True, False])
+def test_a_longer_search_adds_solutions_and_keeps_the_known(turns):
+    """A six-axis arm with a spherical wrist has up to eight."""
+    one, arm = search("hp3_stereo"), scene.arm_of("hp3_stereo")
+    known = one.prospects(20) if turns else one._solved(turns=False)[:20]
+    wide = [one.widened(prospect) for prospect in known]
+    for before, after in zip(known, wide, strict=True):
+        np.testing.assert_array_equal(after.joints[: len(before.joints)], before.joints)
+        np.testing.assert_allclose(
+            arm.forward(after.joints),
+            np.broadcast_to(after.base_from_flange, (*after.joints.shape[:2], 4, 4)),
+            atol=1e-8,
+        )
+        gaps = np.abs(after.joints[:, None] - after.joints[None]).max(axis=(-1, -2))
+        assert (gaps + np.eye(len(gaps)) > 1e-5).all()
+    counts = [sum(len(p.joints) for p in each) for each in (known, wide)]
+    assert counts[1] > 1.2 * counts[0]
+
+
 def test_every_drawn_pose_is_found_or_counted():
     one = search("hp3_stereo_edge")
     found = one.find(25, turns=False)
