@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 # Configurations that decide whether two solids touch at every angle.
 _OVERLAP_SAMPLES = 64
 # Speed of a joint whose model gives none, rad/s or m/s: slow for any arm.
-_UNKNOWN_SPEED = 1.0
+UNKNOWN_SPEED = 1.0
 
 
 class Arm:
@@ -46,6 +46,7 @@ class Arm:
         home: The model's reference configuration, within the limits, shape (q,).
         slides: Which joints slide (else they turn), shape (q,).
         speed: Speed limits, shape (q,), rad/s or m/s; 1 where the model has none.
+        without_speed: Names of the joints whose model has none.
         base_from_world: The base that poses refer to.
         clearance: Solids nearer than this to each other count as colliding, m.
         on_flange: Names of the solids that ride with the flange.
@@ -75,7 +76,8 @@ class Arm:
         self.home = np.clip([j.reference for j in joints], self.lower, self.upper)
         self.slides = np.array([joint.kind == "slide" for joint in joints])
         speed = np.array([joint.speed for joint in joints])
-        self.speed = np.where(np.isfinite(speed), speed, _UNKNOWN_SPEED)
+        self.speed = np.where(np.isfinite(speed), speed, UNKNOWN_SPEED)
+        self.without_speed = tuple(j.name for j in joints if not np.isfinite(j.speed))
         # Per body: the Pinocchio joint that carries it, and its pose there.
         self._carrier: list[int] = []
         self._carried: list[SE3] = []

@@ -18,7 +18,7 @@ from handeye_tri.plan.design import Design
 from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import View
 from handeye_tri.plan.refusal import no_plan
-from handeye_tri.plan.route import RoutePlanner, Stop
+from handeye_tri.plan.route import RoutePlanner, Stop, unknown_speeds
 from handeye_tri.plan.selection import Selection, Selector
 from handeye_tri.records import HalfTurn, Plan, Station
 from handeye_tri.se3 import SE3
@@ -363,7 +363,7 @@ class _Planner:
             certificate,
             self.seed,
             certified.outcome,
-            certified.findings,
+            (*certified.findings, *unknown_speeds(self.arm)),
             via,
         )
 

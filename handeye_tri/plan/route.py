@@ -10,7 +10,7 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.arm import Arm
+from handeye_tri.arm import UNKNOWN_SPEED, Arm
 from handeye_tri.plan.paths import can_go_round, way_round
 from handeye_tri.plan.sequence import Visits, shortest_order, travel_time
 
@@ -23,6 +23,17 @@ _MORE_ROUNDS = 100
 _ORDERS = 80
 # The start in place of an option; also the last of the configurations.
 _START = -1
+
+
+def unknown_speeds(arm: Arm) -> tuple[str, ...]:
+    """A sentence where a programme's times rest on speeds that nobody stated."""
+    if not arm.without_speed:
+        return ()
+    return (
+        f"the model states no speed for {', '.join(arm.without_speed)}: times are for "
+        f"{UNKNOWN_SPEED:g} rad/s or m/s; state it in the model (URDF: velocity, MJCF: "
+        '<numeric name="speed:JOINT">)',
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,6 +16,7 @@ from handeye_tri.plan.candidates import SIGHT_MARGIN
 from handeye_tri.plan.certificate import certify
 from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import View
+from handeye_tri.plan.route import unknown_speeds
 from handeye_tri.plan.sequence import travel_time
 from handeye_tri.records import HalfTurn, Plan, Station
 from handeye_tri.se3 import SE3
@@ -85,7 +86,7 @@ def certify_stations(cell: Cell, arm: Arm, joints: ArrayLike) -> Plan:
         {**certificate.numbers, "cycle_time_s": float(times.sum())},
         0,
         outcome,
-        (*forbidden, *certificate.findings),
+        (*forbidden, *certificate.findings, *unknown_speeds(arm)),
     )
 
 

@@ -142,9 +142,13 @@ def _listed(names: list[str]) -> str:
 
 
 def _speeds(path: Path, model: Any) -> dict[str, float]:
-    """Joint speeds: MJCF ``<numeric name="speed:JOINT">``, URDF ``velocity``."""
-    speeds = {
-        model.numeric(k).name.removeprefix("speed:"): float(model.numeric(k).data[0])
+    """Joint speeds: MJCF ``<numeric name="speed:JOINT">``, URDF ``velocity``.
+
+    Raises:
+        InputError: a speed is not a positive number.
+    """
+    stated = {
+        model.numeric(k).name.removeprefix("speed:"): str(model.numeric(k).data[0])
         for k in range(model.nnumeric)
         if model.numeric(k).name.startswith("speed:")
     }
@@ -153,7 +157,19 @@ def _speeds(path: Path, model: Any) -> dict[str, float]:
         for joint in root.iter("joint"):
             limit = joint.find("limit")
             if limit is not None and "velocity" in limit.attrib:
-                speeds[joint.get("name", "")] = float(limit.attrib["velocity"])
+                stated[joint.get("name", "")] = limit.attrib["velocity"]
+    speeds = {}
+    for joint_name, text in stated.items():
+        try:
+            speeds[joint_name] = float(text)
+        except ValueError:
+            speeds[joint_name] = np.nan
+        if not 0 < speeds[joint_name] < np.inf:
+            raise InputError(
+                f"{path}: joint {joint_name!r}: its speed must be a positive number, "
+                f"rad/s or m/s, got {text!r}; correct it, or leave it out if it is "
+                "not known"
+            )
     return speeds
 
 

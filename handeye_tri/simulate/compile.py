@@ -26,6 +26,7 @@ from handeye_tri.simulate.arrays import (
 from handeye_tri.simulate.engine import import_mujoco, one_line
 from handeye_tri.simulate.props import Prop, add_prop
 from handeye_tri.simulate.rods import rig_board, rig_rods
+from handeye_tri.simulate.urdf import check_urdf
 
 if TYPE_CHECKING:
     from handeye_tri.config import Cell
@@ -52,7 +53,8 @@ def compile_mechanism(cell: Cell, model_path: Path) -> Mechanism:
 
     Raises:
         InputError: the file cannot be read, a frame that the cell names is not in
-            it (lists those that are), or it has joints that are not supported.
+            it (lists those that are), or it has joints that are not supported, or a
+            joint of the arm lacks what a URDF must state.
         MissingDependencyError: MuJoCo's OpenGL library is missing.
     """
     return compile_cell(cell, model_path)[1]
@@ -69,6 +71,7 @@ def compile_cell(
         props: What stands in the cell for some views.
     """
     mujoco = import_mujoco()
+    check_urdf(model_path, cell.arm.flange)
     arm = _load(mujoco, model_path)
     frames = find_frames(cell, model_path, _compile_spec(arm, model_path))
     spec = mujoco.MjSpec()
