@@ -192,9 +192,7 @@ class Design:
     def exchange(self, chosen: list[int], usable: Flags) -> list[int]:
         """Replace one candidate at a time as long as that lowers the cost.
 
-        Fedorov's exchange (Fedorov 1972, Theory of Optimal Experiments, ch. 3). The
-        cost is convex, so that its slope tells without an inverse which candidates
-        cannot improve it.
+        Fedorov's exchange (Fedorov 1972, Theory of Optimal Experiments, ch. 3).
 
         Args:
             chosen: Where to start.
@@ -221,18 +219,47 @@ class Design:
                 break
         return sorted(chosen)
 
-    def _best(self, without: Floats, others: NDArray[np.intp], current: int) -> int:
-        """The candidate that lowers the cost most, the current one if none does."""
+    def swaps(
+        self, chosen: list[int], place: int, usable: Flags, limit: float
+    ) -> NDArray[np.intp]:
+        """What one of the chosen may be replaced by at a cost below a limit.
+
+        Args:
+            chosen: The choice.
+            place: Which of them goes.
+            usable: Which candidates may come, shape (n,).
+            limit: Of the cost then.
+
+        Returns:
+            Indices, ascending.
+        """
+        weights = np.zeros(len(self))
+        weights[chosen] = 1.0
+        without = self._total(weights) - self._information[chosen[place]]
+        members = np.flatnonzero(usable)
+        hopeful, costs = self._costs(without, members[~np.isin(members, chosen)], limit)
+        return np.asarray(hopeful[costs < limit])
+
+    def _costs(
+        self, without: Floats, others: NDArray[np.intp], limit: float
+    ) -> tuple[NDArray[np.intp], Floats]:
+        """Candidates that may cost less than a limit, and what each then costs.
+
+        The cost is convex: its slope bounds it from below without an inverse.
+        """
         covariance = np.asarray(np.linalg.inv(without))
         value = float((self._cost * covariance).sum())
+        hopeful = others[value + self._slopes(covariance, others) < limit]
+        inverses = np.linalg.inv(without + self._information[hopeful])
+        return hopeful, np.einsum("ab,nab->n", self._cost, inverses)
+
+    def _best(self, without: Floats, others: NDArray[np.intp], current: int) -> int:
+        """The candidate that lowers the cost most, the current one if none does."""
         now = np.linalg.inv(without + self._information[current])
         limit = float((self._cost * now).sum()) * (1 - _GAIN)
-        bounds = value + self._slopes(covariance, others)
-        hopeful = others[bounds < limit]
+        hopeful, costs = self._costs(without, others, limit)
         if len(hopeful) == 0:
             return current
-        inverses = np.linalg.inv(without + self._information[hopeful])
-        costs = np.einsum("ab,nab->n", self._cost, inverses)
         best = int(np.argmin(costs))
         if costs[best] >= limit:
             return current

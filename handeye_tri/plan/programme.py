@@ -20,6 +20,7 @@ from handeye_tri.plan.poses import View
 from handeye_tri.plan.refusal import no_plan
 from handeye_tri.plan.route import RoutePlanner, Stop, unknown_speeds
 from handeye_tri.plan.selection import Selection, Selector
+from handeye_tri.plan.shortening import Shortening
 from handeye_tri.records import HalfTurn, Plan, Station
 from handeye_tri.se3 import SE3
 
@@ -52,9 +53,10 @@ def plan_motions(
     2008, Proposition 1, doi:10.1109/TIP.2008.2005562); ways from station to station
     are free, straight in joint space or past the points in ``via``. Among what
     passes, those half-turns are chosen that make the calibration's part of the
-    predicted track error over the workspace box least, and the order of all stations
-    that takes the least time: the two of a half-turn may be apart, and evaluation
-    stations lie among the others.
+    predicted track error over the workspace box least, but for a hundredth that may
+    be given for a shorter programme, and the order of all stations that takes the
+    least time: the two of a half-turn may be apart, and evaluation stations lie among
+    the others.
 
     The certificate holds what :func:`~handeye_tri.plan.certificate.certify` predicts
     from the stations, and
@@ -262,7 +264,21 @@ class _Planner:
         """
         self._done(self.pool_size + self.wanted)
         held_out = self._held_out()
-        usual: list[int] | None = chosen
+        found: dict[int, list[Candidate]] = {}
+
+        def solutions(k: int) -> list[Candidate]:
+            if k not in found:
+                found[k] = search.free(search.widened(pool[k]), _SOLUTIONS)
+            return found[k]
+
+        shortening = Shortening(
+            self.route, selector, pool, lambda k: [c.joints for c in solutions(k)]
+        )
+        usual: list[int] | None = shortening.exchanged(
+            chosen,
+            [[c.joints for c in one] for one in held_out[: self.held_out]],
+            self.visited.joints,
+        )
         for _ in range(_SELECTIONS):
             if usual is None or len(held_out) < self.held_out:
                 break

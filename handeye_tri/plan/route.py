@@ -100,11 +100,7 @@ class RoutePlanner:
         Returns:
             The stations in their order, or the place that is most in the way.
         """
-        stops, ways = self._options(places)
-        joints = np.array([stop.joints for stop in stops])
-        visits = Visits(
-            ways, self.time(start, joints), self.time(joints[:, None], joints[None])
-        )
+        stops, joints, visits = self._visits(places, start)
         moves = _Moves(
             self._arm, np.concatenate([joints, start[None]]), self._seed, self.solids
         )
@@ -120,7 +116,9 @@ class RoutePlanner:
                 # No order does without them, and there is no way round.
                 ends = {stops[k].place for move in blocked for k in move if k >= 0}
                 barred = np.isinf(visits.times).sum(axis=1) + np.isinf(visits.first)
-                return max(ends, key=lambda place: int(barred[ways[place]].max()))
+                return max(
+                    ends, key=lambda place: int(barred[visits.ways[place]].max())
+                )
             for a, b in blocked:
                 seconds = self._seconds(moves, a, b)
                 if a == _START:
@@ -129,6 +127,41 @@ class RoutePlanner:
                     visits.times[a, b] = visits.times[b, a] = seconds
             order = shortest_order(visits, self._seed, _MORE_ROUNDS, order)
         return stops[order.options[-1]].place
+
+    def order(
+        self, places: Sequence[Sequence[Floats]], start: Floats, rounds: int
+    ) -> tuple[float, list[Stop]]:
+        """Seconds and stations of a short order; whether ways are free is not asked.
+
+        Args:
+            places: As for :meth:`drive`.
+            start: Where the arm comes from, shape (q,).
+            rounds: How long to search.
+        """
+        stops, _, visits = self._visits(places, start)
+        order = shortest_order(visits, self._seed, rounds)
+        return order.seconds, [stops[k] for k in order.options]
+
+    def pairs(self, solutions: Floats) -> Floats:
+        """Every way to stand at two stations, (w, 2, q), by solutions (k, 2, q)."""
+        return np.array(
+            [
+                both
+                for before, after in solutions
+                for both in product(self._turned(before), self._turned(after))
+            ]
+        )
+
+    def _visits(
+        self, places: Sequence[Sequence[Floats]], start: Floats
+    ) -> tuple[list[Stop], Floats, Visits]:
+        """Every way to stand at every station, its joints, and what moves take."""
+        stops, ways = self._options(places)
+        joints = np.array([stop.joints for stop in stops])
+        visits = Visits(
+            ways, self.time(start, joints), self.time(joints[:, None], joints[None])
+        )
+        return stops, joints, visits
 
     def _options(
         self, places: Sequence[Sequence[Floats]]

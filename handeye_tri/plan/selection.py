@@ -87,9 +87,10 @@ class Selector:
     def probe(self) -> int:
         """Check the first prospects; returns how many passed."""
         first = range(min(_PROBE, len(self._prospects)))
-        return sum(self._passes(index) for index in first)
+        return sum(self.passes(index) for index in first)
 
-    def _passes(self, index: int) -> bool:
+    def passes(self, index: int) -> bool:
+        """Whether solids allow a prospect; looked at once."""
         if index in self._found:
             return True
         if not self.usable[index]:
@@ -120,12 +121,22 @@ class Selector:
             ahead = self._design.ranked(relaxation.weights, self.usable)
             ahead = ahead[: _RUNNERS_UP * self._wanted]
             before = int(self.usable.sum()) - self._changed
-            blocked = [k for k in {*chosen, *needed} if not self._passes(int(k))]
+            blocked = [k for k in {*chosen, *needed} if not self.passes(int(k))]
             if not blocked and before == int(self.usable.sum()) - self._changed:
                 return Selection(chosen, relaxation.bound)
             for k in ahead:
-                self._passes(int(k))
+                self.passes(int(k))
         return None
+
+    def cost(self, chosen: list[int]) -> float:
+        """What a choice costs; see Design."""
+        weights = np.zeros(len(self._prospects))
+        weights[chosen] = 1.0
+        return self._design.cost(weights)
+
+    def swaps(self, chosen: list[int], place: int, limit: float) -> NDArray[np.intp]:
+        """Usable prospects that may stand for one of the chosen; see Design."""
+        return self._design.swaps(chosen, place, self.usable, limit)
 
     def replace(self, chosen: list[int], unwanted: int) -> list[int] | None:
         """The best choice without one of a choice's half-turns, checked."""
@@ -138,7 +149,7 @@ class Selector:
             missing = self._wanted - len(chosen)
             chosen += [int(k) for k in ranked if k not in chosen][:missing]
             chosen = self._design.exchange(chosen, self.usable)
-            free = [k for k in chosen if self._passes(k)]
+            free = [k for k in chosen if self.passes(k)]
             if len(free) == self._wanted:
                 return chosen
             chosen = [k for k in free if self.usable[k]]

@@ -80,8 +80,8 @@ def _check_joint(path: Path, joint: ElementTree.Element) -> None:
     missing = [key for key in ("lower", "upper") if key not in stated]
     if missing:
         raise InputError(
-            f"{path}: joint {name!r} is {kind} and states no {' and no '.join(missing)} "
-            f"limit; {remedy}"
+            f"{path}: joint {name!r} is {kind} and states no "
+            f"{' and no '.join(missing)} limit; {remedy}"
         )
     try:
         lower, upper = float(stated["lower"]), float(stated["upper"])

@@ -96,3 +96,19 @@ def test_as_many_candidates_as_wanted_leave_no_choice():
     relaxation = Design(*parts).relax(4, np.ones(4, dtype=bool))
     np.testing.assert_array_equal(relaxation.weights, np.ones(4))
     assert relaxation.bound == pytest.approx(price(*parts, np.ones(4)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_swaps_are_all_that_cost_less_than_a_limit(seed):
+    parts = problem(seed)
+    design, usable = Design(*parts), np.arange(ALL) != 7
+    chosen = [0, 2, 5, 8]
+    costs = {
+        k: price(*parts, ones([0, 2, k, 8]))
+        for k in range(ALL)
+        if k not in chosen + [7]
+    }
+    limit = float(np.median(list(costs.values())))
+    found = design.swaps([0, 2, 5, 8], 2, usable, limit)
+    assert found.tolist() == [k for k, cost in costs.items() if cost < limit]
+    assert len(found) > 0
