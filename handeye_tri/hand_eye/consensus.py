@@ -6,6 +6,8 @@ radius r of a hypothesis and the others anywhere within the radius R of the scen
 description length of all residuals is (6 m - 12) log r + 6 (n - m) log R up to
 constants; the best m is taken for each hypothesis, and the shortest wins (as in
 a-contrario RANSAC, Moisan and Stival 2004, doi:10.1023/B:VISI.0000013094.38752.0a).
+Where the right poses turn about one direction only, no sample of them tells all turns:
+samples are then solved for such turns, and the shorter description decides which.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri.hand_eye.few_axes import rotations_of_few_axes, turns_are_few
 from handeye_tri.se3 import nearest_rotation
 
 Floats = NDArray[np.float64]
@@ -32,6 +35,10 @@ _REACH = 3.0
 # Shifts along directions told by less than this share of the best told one (turns of a
 # milliradian beside turns of a radian) are left at zero: a start must stay in the cell.
 _LEAST_TOLD = 1e-6
+# A scale stays 1 where shifts explain all but this share of b's places (turns on the
+# spot, where only noise is left), or what is left on both sides hardly correlates.
+_SCALE_TOLD = 1e-4
+_ALIKE = 0.5
 # Residuals below this share of the scene are rounding.
 _ROUNDING = 1e-9
 
@@ -45,16 +52,48 @@ class Consensus:
         z: Shape (4, 4).
         scale: Metres per unit of b's translations; 1 where it was not asked for.
         agreeing: Whether each pose agrees, shape (n,).
+        description: Its length, in units of information; comparable between solutions
+            of the same poses.
+        few_axes: Whether it takes the turns to be about one direction or none; what
+            the poses leave open is then as short as can be.
     """
 
     x: Floats
     z: Floats
     scale: float
     agreeing: NDArray[np.bool_]
+    description: float
+    few_axes: bool
+
+
+def find_start(
+    a: Floats, b: Floats, *, free_scale: bool = False, seed: int = 0
+) -> Consensus:
+    """What most poses agree on, whether they turn about several directions or few.
+
+    Args:
+        a: Shape (n, 4, 4), n >= 3.
+        b: Shape (n, 4, 4).
+        free_scale: Whether b's translations have a unit of their own.
+        seed: Of the random samples; the same seed gives the same result.
+    """
+    several, few = (
+        find_consensus(a, b, free_scale=free_scale, seed=seed, few_axes=few_axes)
+        for few_axes in (False, True)
+    )
+    best = min(several, few, key=lambda one: one.description)
+    # Only among the poses that agree do turns, and does a misfit tell the noise.
+    right = best.agreeing
+    return few if turns_are_few(a[right], b[right], best.x, best.z) else several
 
 
 def find_consensus(
-    a: Floats, b: Floats, *, free_scale: bool = False, seed: int = 0
+    a: Floats,
+    b: Floats,
+    *,
+    free_scale: bool = False,
+    seed: int = 0,
+    few_axes: bool = False,
 ) -> Consensus:
     """Solve ``a_i X = Z b_i`` for most of the poses; up to half may be wrong.
 
@@ -63,6 +102,7 @@ def find_consensus(
         b: Shape (n, 4, 4).
         free_scale: Whether b's translations have a unit of their own.
         seed: Of the random samples; the same seed gives the same result.
+        few_axes: Whether all turns are about one direction, or there are none.
     """
     n = len(a)
     rng = np.random.default_rng(seed)
@@ -71,14 +111,14 @@ def find_consensus(
     length = scene_length(a)
     samples = rng.random((_SAMPLES, n)).argpartition(2, axis=1)[:, :3]
     x, z, scale = solve_samples(
-        a[samples], b[samples], np.ones(samples.shape), free_scale
+        a[samples], b[samples], np.ones(samples.shape), free_scale, few_axes
     )
     # All poses together are one more hypothesis: the best where none is wrong.
     hypotheses = [
         np.concatenate([one, other])
         for one, other in zip(
             (x, z, scale),
-            solve_samples(a[None], b[None], np.ones((1, n)), free_scale),
+            solve_samples(a[None], b[None], np.ones((1, n)), free_scale, few_axes),
             strict=True,
         )
     ]
@@ -94,6 +134,7 @@ def find_consensus(
             np.broadcast_to(scored_b, shape),
             weights.astype(float),
             free_scale,
+            few_axes,
         )
         again, reach = _lengths(scored_a, scored_b, list(improved), length)
         better = again < scores
@@ -106,7 +147,14 @@ def find_consensus(
     winner = int(np.argmin(scores))
     chosen = [part[winner : winner + 1] for part in hypotheses]
     agreeing = _residuals(a, b, chosen, length)[0] <= radii[winner]
-    return Consensus(chosen[0][0], chosen[1][0], float(chosen[2][0]), agreeing)
+    return Consensus(
+        chosen[0][0],
+        chosen[1][0],
+        float(chosen[2][0]),
+        agreeing,
+        float(scores[winner]),
+        few_axes,
+    )
 
 
 def scene_length(a: Floats) -> float:
@@ -122,60 +170,90 @@ def scene_length(a: Floats) -> float:
 
 
 def solve_samples(
-    a: Floats, b: Floats, weights: Floats, free_scale: bool
+    a: Floats,
+    b: Floats,
+    weights: Floats,
+    free_scale: bool = False,
+    few_axes: bool = False,
 ) -> tuple[Floats, Floats, Floats]:
-    """Shah 2013 (doi:10.1115/1.4024473) for many samples at once, scale on request.
+    """Rotations, then translations, for many samples at once, scale on request.
 
     Args:
         a: Shape (h, k, 4, 4): k poses for each of h samples.
         b: Shape (h, k, 4, 4).
         weights: Shape (h, k), not negative.
         free_scale: Whether a factor on b's translations is solved for.
+        few_axes: Whether all turns are about one direction, or there are none.
 
     Returns:
-        X and Z, shape (h, 4, 4) each, and the factors, shape (h,). A sample that
-        determines nothing gives some motion: score it.
+        X and Z, shape (h, 4, 4) each, and the factors, shape (h,), 1 where nothing
+        tells them. A sample that determines nothing gives some motion: score it.
     """
+    h = len(weights)
+    solve = rotations_of_few_axes if few_axes else _rotations
+    rx, rz = solve(a, b, weights)
+    ra, ta = a[..., :3, :3], a[..., :3, 3]
+    turned = b[..., :3, 3] @ np.swapaxes(rz, 1, 2)
+    total, weighted = weights.sum(axis=1), weights[..., None, None] * ra
+    # R_A t_X - t_Z = f R_Z t_B - t_A, by normal equations in (t_X, t_Z).
+    normal = np.zeros((h, 6, 6))
+    normal[:, :3, :3] = normal[:, 3:, 3:] = total[:, None, None] * np.eye(3)
+    normal[:, :3, 3:] = -np.swapaxes(weighted.sum(axis=1), 1, 2)
+    normal[:, 3:, :3] = np.swapaxes(normal[:, :3, 3:], 1, 2)
+    inverse = np.linalg.pinv(normal, rcond=_LEAST_TOLD, hermitian=True)
+
+    def explained(places: Floats) -> tuple[Floats, Floats]:
+        """Shifts (h, 6) by which both sides' frames explain places, and the rest."""
+        right = np.concatenate(
+            [
+                np.einsum("hkab,hka->hb", weighted, places),
+                -np.einsum("hk,hka->ha", weights, places),
+            ],
+            axis=1,
+        )
+        shifts = (inverse @ right[..., None])[..., 0]
+        moved = np.einsum("hkab,hb->hka", ra, shifts[:, :3]) - shifts[:, None, 3:]
+        return shifts, places - moved
+
+    shifts_a, rest_a = explained(ta)
+    shifts_b, rest_b = explained(turned)
+    scale = np.ones(h)
+    if free_scale:
+        # The factor is told by what shifts leave of the places on both sides.
+        centre = np.einsum("hk,hka->ha", weights, turned)
+        centre /= np.maximum(total, 1e-300)[:, None]
+        away = turned - centre[:, None]
+        spread, left_b, left_a, along = (
+            np.einsum("hk,hka,hka->h", weights, one, other)
+            for one, other in (
+                *((away, away), (rest_b, rest_b)),
+                *((rest_a, rest_a), (rest_a, rest_b)),
+            )
+        )
+        told = (left_b > _SCALE_TOLD * spread) & (
+            along > _ALIKE * np.sqrt(left_a * left_b)
+        )
+        scale = np.where(told, along / np.where(told, left_b, 1.0), 1.0)
+    shifts = scale[:, None] * shifts_b - shifts_a
+    x, z = np.tile(np.eye(4), (2, h, 1, 1))
+    x[:, :3, :3], x[:, :3, 3] = rx, shifts[:, :3]
+    z[:, :3, :3], z[:, :3, 3] = rz, shifts[:, 3:]
+    return x, z, scale
+
+
+def _rotations(a: Floats, b: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """X's and Z's by Shah 2013 (doi:10.1115/1.4024473), shape (h, 3, 3) each."""
     h, k = weights.shape
-    ra, rb = a[..., :3, :3], b[..., :3, :3]
-    ta, tb = a[..., :3, 3], b[..., :3, 3]
-    # In a unit of its own, b would spoil the normal equations' balance.
-    unit = max(float(np.median(np.linalg.norm(tb, axis=-1))), 1e-300)
-    unit = unit if free_scale else 1.0
-    tb = tb / unit
-    total = weights.sum(axis=1)
-    weighted = weights[..., None, None] * ra
-    kronecker = np.swapaxes(weighted.reshape(h, k, 9), 1, 2) @ rb.reshape(h, k, 9)
+    left = (weights[..., None, None] * a[..., :3, :3]).reshape(h, k, 9)
+    kronecker = np.swapaxes(left, 1, 2) @ b[..., :3, :3].reshape(h, k, 9)
     kronecker = kronecker.reshape(h, 3, 3, 3, 3).transpose(0, 1, 3, 2, 4)
     u, _, vt = np.linalg.svd(kronecker.reshape(h, 9, 9))
     entries = vt[:, 0].reshape(h, 3, 3)
     sign = np.sign(np.linalg.det(entries))[:, None, None]
-    rx = nearest_rotation(sign * entries)
-    rz = nearest_rotation(sign * u[:, :, 0].reshape(h, 3, 3))
-    # R_A t_X - t_Z - f R_Z t_B = -t_A, by normal equations in (t_X, t_Z, f).
-    turned = tb @ np.swapaxes(rz, 1, 2)
-    size = 7 if free_scale else 6
-    normal, right = np.zeros((h, size, size)), np.zeros((h, size))
-    normal[:, :3, :3] = total[:, None, None] * np.eye(3)
-    normal[:, 3:6, 3:6] = normal[:, :3, :3]
-    normal[:, :3, 3:6] = -np.swapaxes(weighted.sum(axis=1), 1, 2)
-    normal[:, 3:6, :3] = np.swapaxes(normal[:, :3, 3:6], 1, 2)
-    target = -ta if free_scale else turned - ta
-    right[:, :3] = np.einsum("hkab,hka->hb", weighted, target)
-    right[:, 3:6] = -np.einsum("hk,hka->ha", weights, target)
-    if free_scale:
-        normal[:, :3, 6] = -np.einsum("hkab,hka->hb", weighted, turned)
-        normal[:, 3:6, 6] = np.einsum("hk,hka->ha", weights, turned)
-        normal[:, 6, :6] = normal[:, :6, 6]
-        normal[:, 6, 6] = np.einsum("hk,hka,hka->h", weights, turned, turned)
-        right[:, 6] = -np.einsum("hk,hka,hka->h", weights, turned, target)
-    solution = (
-        np.linalg.pinv(normal, rcond=_LEAST_TOLD, hermitian=True) @ right[..., None]
-    )[..., 0]
-    x, z = np.tile(np.eye(4), (2, h, 1, 1))
-    x[:, :3, :3], x[:, :3, 3] = rx, solution[:, :3]
-    z[:, :3, :3], z[:, :3, 3] = rz, solution[:, 3:6]
-    return x, z, solution[:, 6] / unit if free_scale else np.ones(h)
+    return (
+        nearest_rotation(sign * entries),
+        nearest_rotation(sign * u[:, :, 0].reshape(h, 3, 3)),
+    )
 
 
 def _residuals(a: Floats, b: Floats, found: list[Floats], length: float) -> Floats:

@@ -1,10 +1,11 @@
-"""Starts for AX = ZB where the turns do not span space: 4-axis robots and the like.
+"""AX = ZB where the turns do not span space: 4-axis robots and the like.
 
-With all turns about one direction n (in the base; m in B's frame), the rotation
-equations only say that Z carries m to n: one angle is free. Positions may tell it: with
-Z = (cos f) P + (sin f) Q + n n'... they are linear in (cos f, sin f, t_X, t_Z). Where
-nothing turns, positions alone give Z's rotation (Procrustes). What stays undetermined
-is the least-squares solution's shortest.
+With all turns about one direction n (in the base; m in B's base frame), the rotation
+equations only say that Z carries m to n: one angle is free. Across n everything is
+plane and complex: turns are unit numbers a_k, and positions obey
+``a_k u - w - g q_k = -p_k`` with unknown u (of t_X), w (of t_Z) and g, whose argument
+is the angle and whose size is the scale. Where nothing turns, positions alone give Z's
+rotation (Procrustes). What stays undetermined is the least-squares solution's shortest.
 """
 
 from __future__ import annotations
@@ -12,12 +13,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.se3 import hat, nearest_rotation, so3_exp, so3_log
+from handeye_tri.se3 import nearest_rotation, so3_log
 
 Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
 
 # Poses that turn by less than this do not turn, radians.
-NO_TURN = np.radians(1.0)
+_NO_TURN = np.radians(1.0)
+# Unknowns told by less than this share of the best told one are left at zero.
+_LEAST_TOLD = 1e-9
 
 
 def turns_are_few(a: Floats, b: Floats, x: Floats, z: Floats) -> bool:
@@ -29,79 +33,97 @@ def turns_are_few(a: Floats, b: Floats, x: Floats, z: Floats) -> bool:
         x: Some solution that fits the rotations, shape (4, 4).
         z: Shape (4, 4).
     """
-    vectors, _ = _turns(a, b)
+    vectors = so3_log(a[:, :3, :3] @ a[0, :3, :3].T)
     spread = np.linalg.svd(vectors, compute_uv=False) / np.sqrt(len(a))
     misfit = so3_log(
         np.swapaxes(a[:, :3, :3] @ x[:3, :3], 1, 2) @ z[:3, :3] @ b[:, :3, :3]
     )
     # Median over poses: one wrong pose must not make parallel axes of good ones.
     noise = np.median(np.linalg.norm(misfit, axis=1))
-    return bool(spread[1] < max(4 * noise, 0.5 * NO_TURN))
+    return bool(spread[1] < max(4 * noise, 0.5 * _NO_TURN))
 
 
-def start_from_few_axes(a: Floats, b: Floats) -> tuple[Floats, Floats]:
-    """X and Z, shape (4, 4) each, of poses that turn about one direction or not at all.
+def rotations_of_few_axes(
+    a: Floats, b: Floats, weights: Floats
+) -> tuple[Floats, Floats]:
+    """X's and Z's rotations of samples that turn about one direction or not at all.
 
     Args:
-        a: Shape (n, 4, 4), metres.
-        b: Shape (n, 4, 4), metres.
+        a: Shape (h, k, 4, 4): k poses for each of h samples.
+        b: Shape (h, k, 4, 4), translations in any unit.
+        weights: Shape (h, k), not negative.
+
+    Returns:
+        Shape (h, 3, 3) each.
     """
-    ra, rb = a[:, :3, :3], b[:, :3, :3]
-    ta, tb = a[:, :3, 3], b[:, :3, 3]
-    turns_a, turns_b = _turns(a, b)
-    if np.linalg.norm(turns_a, axis=1).max() < NO_TURN:
-        moment = (ta - ta.mean(axis=0)).T @ (tb - tb.mean(axis=0))
-        rotation = nearest_rotation(moment)
-    else:
-        n = np.linalg.svd(turns_a)[2][0]
-        # Opposite signs of both turns' axes belong together.
-        m = turns_b.T @ (turns_a @ n)
-        rotation = _angle_from_positions(a, b, n, _carry(m / np.linalg.norm(m), n))
-    x, z = np.tile(np.eye(4), (2, 1, 1))
-    z[:3, :3] = rotation
-    x[:3, :3] = nearest_rotation((np.swapaxes(ra, 1, 2) @ rotation @ rb).mean(axis=0))
-    rows = np.concatenate([ra, np.broadcast_to(-np.eye(3), ra.shape)], axis=2)
-    right = tb @ rotation.T - ta
-    solution = np.linalg.lstsq(rows.reshape(-1, 6), right.ravel(), rcond=1e-6)[0]
-    x[:3, 3], z[:3, 3] = solution[:3], solution[3:]
-    return x, z
-
-
-def _turns(a: Floats, b: Floats) -> tuple[Floats, Floats]:
-    """Rotation vectors from the first pose, in the base and in B's frame, (n, 3)."""
-    return (
-        so3_log(a[:, :3, :3] @ a[0, :3, :3].T),
-        so3_log(b[:, :3, :3] @ b[0, :3, :3].T),
+    share = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+    base_a, flange_a, turning = _axes(a, share)
+    base_b, flange_b, _ = _axes(b, share)
+    turns_a, turns_b = _turns(a, base_a, flange_a), _turns(b, base_b, flange_b)
+    # The axis of b may point either way: of the turns one sense agrees.
+    same = np.abs((share * turns_a * turns_b.conj()).sum(axis=1))
+    other = np.abs((share * turns_a * turns_b).sum(axis=1))
+    base_b[..., 1:] *= np.where(other > same, -1.0, 1.0)[:, None, None]
+    # Across the axis, one number each; unknowns u, w, g in the head's words.
+    places = [
+        np.einsum("hkj,hj->hk", poses[..., :3, 3], base[..., 0])
+        + 1j * np.einsum("hkj,hj->hk", poses[..., :3, 3], base[..., 1])
+        for poses, base in ((a, base_a), (b, base_b))
+    ]
+    size = np.sqrt((share * np.abs(places[1]) ** 2).sum(axis=1))[:, None]
+    rows = np.stack(
+        [turns_a, -np.ones_like(turns_a), -places[1] / np.maximum(size, 1e-300)], axis=2
     )
+    adjoint = np.swapaxes(share[..., None] * rows, 1, 2).conj()
+    told = np.linalg.pinv(adjoint @ rows, rcond=_LEAST_TOLD, hermitian=True)
+    unknowns = told @ adjoint @ -places[0][..., None]
+    angle = np.angle(unknowns[:, 2, 0])
+    z = base_a @ _about_third(angle) @ np.swapaxes(base_b, 1, 2)
+    still = _procrustes(a, b, share)
+    z = np.where(turning[:, None, None], z, still)
+    turned = np.swapaxes(a[..., :3, :3], 2, 3) @ z[:, None] @ b[..., :3, :3]
+    return nearest_rotation(np.einsum("hk,hkij->hij", share, turned)), z
 
 
-def _carry(m: Floats, n: Floats) -> Floats:
-    """Some rotation that carries unit vector m to n, shape (3, 3)."""
-    axis = np.cross(m, n)
-    sine, cosine = np.linalg.norm(axis), m @ n
-    if sine < 1e-9:
-        axis = np.linalg.svd(m[None])[2][1]
-        return so3_exp(axis * (0.0 if cosine > 0 else np.pi))
-    return so3_exp(axis / sine * np.arctan2(sine, cosine))
+def _axes(poses: Floats, share: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Frames whose third axis is the turns', on both sides, and whether any turns.
+
+    A mean of rotations about one axis keeps that axis' length and shortens what is
+    across it: its first singular vectors are the axis on either side.
+
+    Returns:
+        In the base (h, 3, 3), in the flange (h, 3, 3), and (h,).
+    """
+    mean = np.einsum("hk,hkij->hij", share, poses[..., :3, :3])
+    u, values, vt = np.linalg.svd(mean)
+    base, flange = u[..., [1, 2, 0]], np.swapaxes(vt, 1, 2)[..., [1, 2, 0]]
+    for frame in (base, flange):
+        frame[..., 1] *= np.sign(np.linalg.det(frame))[:, None]
+    return base, flange, values[:, 1] < np.cos(_NO_TURN)
 
 
-def _angle_from_positions(a: Floats, b: Floats, n: Floats, carry: Floats) -> Floats:
-    """Turn about n, after ``carry``, that the positions ask for."""
-    ra, ta = a[:, :3, :3], a[:, :3, 3]
-    turned = b[:, :3, 3] @ carry.T
-    along = np.outer(turned @ n, n)
-    across, third = turned - along, turned @ hat(n).T
-    # R_A t_X - t_Z - cos f across - sin f third = along - t_A.
-    rows = np.concatenate(
-        [
-            ra,
-            np.broadcast_to(-np.eye(3), ra.shape),
-            -across[:, :, None],
-            -third[:, :, None],
-        ],
-        axis=2,
+def _turns(poses: Floats, base: Floats, flange: Floats) -> Complexes:
+    """Unit numbers by which poses turn the flange's frame into the base's, (h, k)."""
+    first = poses[..., :3, :3] @ flange[:, None, :, :1]
+    across = (np.swapaxes(base[..., :2], 1, 2)[:, None] @ first)[..., 0]
+    turns = across[..., 0] + 1j * across[..., 1]
+    return np.asarray(turns / np.maximum(np.abs(turns), 1e-300))
+
+
+def _about_third(angle: Floats) -> Floats:
+    """Turns about the third axis, shape (h, 3, 3)."""
+    turn = np.zeros((len(angle), 3, 3))
+    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)
+    turn[:, 1, 0] = np.sin(angle)
+    turn[:, 0, 1] = -turn[:, 1, 0]
+    turn[:, 2, 2] = 1.0
+    return turn
+
+
+def _procrustes(a: Floats, b: Floats, share: Floats) -> Floats:
+    """Z's rotation where nothing turns, from positions alone, shape (h, 3, 3)."""
+    left, right = (
+        poses[..., :3, 3] - np.einsum("hk,hki->hi", share, poses[..., :3, 3])[:, None]
+        for poses in (a, b)
     )
-    right = (along - ta).ravel()
-    solution = np.linalg.lstsq(rows.reshape(-1, 8), right, rcond=1e-6)[0]
-    angle = np.arctan2(solution[7], solution[6])
-    return np.asarray(so3_exp(angle * n) @ carry)
+    return nearest_rotation(np.einsum("hk,hki,hkj->hij", share, left, right))

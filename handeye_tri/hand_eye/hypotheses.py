@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.hand_eye.consensus import find_consensus, scene_length
-from handeye_tri.hand_eye.few_axes import start_from_few_axes, turns_are_few
+from handeye_tri.hand_eye.consensus import find_start, scene_length
 from handeye_tri.hand_eye.pose_fit import fit_poses
 from handeye_tri.hand_eye.pose_model import PoseInput
 from handeye_tri.hand_eye.pose_solution import PoseSolution, residuals_of
@@ -142,14 +141,10 @@ def free_scale_of(solution: PoseSolution) -> tuple[float, float]:
 def _read(
     key: str, meaning: str, a: Floats, b: Floats, seed: int, free_scale: bool
 ) -> Reading:
-    found = find_consensus(a, b, free_scale=free_scale, seed=seed)
-    x, z, scale = found.x, found.z, found.scale
-    if turns_are_few(a, b, x, z):
-        x, z = start_from_few_axes(a, b)
-        scale = 1.0
+    found = find_start(a, b, free_scale=free_scale, seed=seed)
     scaled = np.array(b)
-    scaled[:, :3, 3] *= scale
-    return _reading(key, meaning, a, scaled, SE3(x), SE3(z), scale)
+    scaled[:, :3, 3] *= found.scale
+    return _reading(key, meaning, a, scaled, SE3(found.x), SE3(found.z), found.scale)
 
 
 def _reading(

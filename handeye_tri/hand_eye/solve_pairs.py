@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.hand_eye.absolute import AbsoluteMethod, solve_axzb
 from handeye_tri.hand_eye.clock import RobotTrack, correlate_clocks
-from handeye_tri.hand_eye.consensus import find_consensus
-from handeye_tri.hand_eye.few_axes import NO_TURN, start_from_few_axes, turns_are_few
+from handeye_tri.hand_eye.consensus import find_start
 from handeye_tri.hand_eye.motions import check_motions, relative_motions
 from handeye_tri.hand_eye.pose_fit import fit_poses, squared_distances
 from handeye_tri.hand_eye.pose_model import PoseFit, PoseInput
@@ -196,13 +195,8 @@ def _start(
             "is determined; record poses that turn by 20 degrees or more about two "
             "different axes"
         )
-    found = find_consensus(a, b, free_scale=data.free_scale, seed=seed)
-    # Only among the poses that agree does a misfit tell the noise.
-    right = found.agreeing
-    if turned < NO_TURN or turns_are_few(a[right], b[right], found.x, found.z):
-        # A scale cannot be told from a shift here unless positions do: start at 1.
-        x, z = start_from_few_axes(a, b)
-        return replace(data, few_axes=True), x, z, 1.0, np.ones(len(a), bool)
+    found = find_start(a, b, free_scale=data.free_scale, seed=seed)
+    data = replace(data, few_axes=found.few_axes)
     return data, found.x, found.z, found.scale, found.agreeing
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pose_scene import NOISE, noisy, pairs_of, random_poses, scene
+from pose_scene import pairs_of, random_poses, scene
 
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.hand_eye import PAIR_METHODS, solve_pose_pairs
@@ -132,111 +132,6 @@ def test_an_unknown_target_size_is_solved_for():
     np.testing.assert_allclose(
         found.b[:, :3, 3], se3_inverse(observed / 1)[:, :3, 3] * found.scale, atol=1e-12
     )
-
-
-def scara(seed, with_shifts=True, n=25):
-    """A 4-axis robot: turns about one axis, shifts along all three."""
-    rng = np.random.default_rng([seed, 4])
-    x, z = random_poses(rng, 2, 0.15)
-    turns = np.zeros((n, 6))
-    if with_shifts:
-        turns[:, :3] = (0.25, 0.25, 0.1) * rng.standard_normal((n, 3))
-    turns[:, 5] = rng.uniform(-2, 2, n)
-    lean = se3_exp([0.4, 0.1, 0.3, 0.7, -0.4, 0.2])
-    a = lean @ se3_exp(turns)
-    camera_from_target = se3_inverse(z) @ a @ x
-    shift = np.eye(4)
-    shift[2, 3] = 2.0
-    camera_from_target, z = shift @ camera_from_target, z @ se3_inverse(shift)
-    robot, observed = noisy(rng, a, camera_from_target, NOISE)
-    return robot, observed, x, z, lean[:3, 2]
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_four_axis_robot_leaves_one_shift_open_and_takes_a_measured_one(seed):
-    robot, observed, x, z, axis_in_base = scara(seed)
-    pairs = pairs_of(robot, observed, "eye_to_hand")
-    found = solve_pose_pairs(pairs)
-    (one,) = found.undetermined
-    assert one.kind == "shift"
-    np.testing.assert_allclose(one.axis_in_flange, (0, 0, 1), atol=2e-3)
-    np.testing.assert_allclose(one.axis_in_base, axis_in_base, atol=2e-3)
-    assert "shift along the axis" in one.text
-    # Everything else is right: rotation, and the shift across the axis.
-    assert np.degrees((found.x.inverse() @ SE3(x)).angle) < 0.3
-    np.testing.assert_allclose(found.x.translation[:2], x[:2, 3], atol=5e-3)
-    measured = solve_pose_pairs(pairs, shift_along_axis=float(x[2, 3]))
-    assert measured.undetermined == ()
-    np.testing.assert_allclose(measured.x.translation, x[:3, 3], atol=5e-3)
-    np.testing.assert_allclose(measured.z.translation, z[:3, 3], atol=2e-2)
-    before, after = (
-        np.sqrt(np.mean(one.residual_positions**2)) for one in (found, measured)
-    )
-    assert after < 1.1 * before
-
-
-def five_axes(seed, yaws=1.0, rolls=1.0, n=25):
-    """A 5-axis arm: its tool stays in the upright plane through the base's axis."""
-    rng = np.random.default_rng([seed, 5])
-    x, z = random_poses(rng, 2, 0.15)
-    yaw, pitch, roll, out = np.zeros((4, n, 6))
-    yaw[:, 5] = yaws * rng.uniform(-0.7, 0.7, n)
-    out[:, 0], out[:, 2] = rng.uniform((0.3, 0.1), (0.6, 0.5), (n, 2)).T
-    pitch[:, 4] = rng.uniform(0.6, 2.2, n)
-    roll[:, 5] = rolls * rng.uniform(-1.5, 1.5, n)
-    a = se3_exp(yaw) @ se3_exp(out) @ se3_exp(pitch) @ se3_exp(roll)
-    camera_from_target = se3_inverse(z) @ a @ x
-    shift = np.eye(4)
-    shift[2, 3] = 2.0
-    camera_from_target, z = shift @ camera_from_target, z @ se3_inverse(shift)
-    return *noisy(rng, a, camera_from_target, NOISE), x
-
-
-@pytest.mark.parametrize(("yaws", "rolls"), [(1, 1), (1, 0), (0, 1)])
-def test_a_five_axis_robot_that_uses_two_of_its_turns_leaves_nothing_open(yaws, rolls):
-    errors = []
-    for seed in range(6):
-        robot, observed, x = five_axes(seed, yaws, rolls)
-        found = solve_pose_pairs(pairs_of(robot, observed, "eye_to_hand"))
-        assert found.undetermined == ()
-        error = (found.x.inverse() @ SE3(x)).log()
-        covariance = found.covariance.matrix[:6, :6]
-        errors.append(error @ np.linalg.solve(covariance, error) / 6)
-    assert 0.4 < np.mean(errors) < 2.0
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_five_axis_robot_that_only_pitches_leaves_one_shift_open(seed):
-    robot, observed, x = five_axes(seed, yaws=0, rolls=0)
-    pairs = pairs_of(robot, observed, "eye_to_hand")
-    (one,) = solve_pose_pairs(pairs).undetermined
-    assert one.kind == "shift"
-    np.testing.assert_allclose(one.axis_in_flange, (0, 1, 0), atol=2e-3)
-    np.testing.assert_allclose(one.axis_in_base, (0, 1, 0), atol=2e-3)
-    measured = solve_pose_pairs(pairs, shift_along_axis=float(x[1, 3]))
-    assert measured.undetermined == ()
-    np.testing.assert_allclose(measured.x.translation, x[:3, 3], atol=5e-3)
-
-
-def test_one_turning_joint_leaves_a_turn_and_a_shift_open():
-    robot, observed, *_ = scara(0, with_shifts=False)
-    found = solve_pose_pairs(pairs_of(robot, observed, "eye_to_hand"))
-    assert sorted(one.kind for one in found.undetermined) == ["shift", "turn"]
-    for one in found.undetermined:
-        np.testing.assert_allclose(one.axis_in_flange, (0, 0, 1), atol=0.02)
-    with pytest.raises(DegenerateMotionError):
-        solve_pose_pairs(pairs_of(robot, observed, "eye_to_hand"), method="shah")
-
-
-def test_without_turns_three_shifts_are_open_and_the_rotation_is_right():
-    rng = np.random.default_rng(8)
-    x, z = random_poses(rng, 2, 0.2)
-    a = np.tile(random_poses(rng, 1), (15, 1, 1))
-    a[:, :3, 3] += 0.2 * rng.standard_normal((15, 3))
-    robot, observed = noisy(rng, a, se3_inverse(z) @ a @ x, NOISE)
-    found = solve_pose_pairs(pairs_of(robot, observed, "eye_to_hand"))
-    assert [one.kind for one in found.undetermined] == ["shift"] * 3
-    assert np.degrees((found.x.inverse() @ SE3(x)).angle) < 0.5
 
 
 def test_the_same_pose_over_and_over_is_refused():
