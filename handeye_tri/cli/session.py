@@ -217,6 +217,13 @@ def _robot_errors(
     from handeye_tri.pipeline.run import ROBOT_ERRORS
 
     asked = tuple(value.split(",")) if value else ()
+    if "clock-offset" in asked:
+        raise click.BadParameter(
+            "no session tells clock-offset: the robot stands still at its stations, so "
+            "that a late image shows the same; record both streams while the robot "
+            "moves and give every pose its time_s for handeye-tri solve, which finds "
+            "the offset (in Python adjust takes clock_offset(velocities), too)"
+        )
     unknown = [name for name in asked if name not in ROBOT_ERRORS]
     if unknown:
         raise click.BadParameter(

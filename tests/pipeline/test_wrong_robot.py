@@ -144,3 +144,9 @@ def test_errors_of_the_robot_need_the_joint_method(observed, tmp_path):
     done = command("calibrate", folder, "--robot", "elbow")
     assert done.returncode == 2
     assert "joint-offsets or link-corrections" in done.stderr
+    before = {path: path.read_bytes() for path in folder.glob("*.json")}
+    done = command("calibrate", folder, "--robot", "joint-offsets,clock-offset")
+    assert done.returncode == 2
+    assert "stands still" in done.stderr
+    assert "handeye-tri solve" in done.stderr
+    assert before == {path: path.read_bytes() for path in folder.glob("*.json")}
