@@ -7,7 +7,7 @@ import pytest
 from finished_session import finished
 
 from handeye_tri.evaluate.views import check_views, predicted_pixels
-from handeye_tri.records import Repeatability
+from handeye_tri.records import DroppedHalfTurn, Repeatability
 from handeye_tri.synthesize import reference_geometry, synthesize
 
 
@@ -84,6 +84,12 @@ def test_what_was_not_seen_is_named_and_comes_last(geometry):
     blind = checks[-1]
     assert (blind.camera, blind.station, blind.unseen) == ("left", 1, "ABC")
     assert (blind.worst, blind.code) == ("", "UNSEEN")
+    dropped = [DroppedHalfTurn("left", 0, 0, 1, "stale")]
+    found = check_views(
+        truth_as_result(geometry, finished().calibration), session, dropped
+    )
+    codes = {(one.camera, one.station): one.code for one in found}
+    assert (codes["left", 1], codes["right", 1]) == ("LEFT OUT", "")
     (partly,) = [check for check in checks if check.unseen == "A"]
     assert partly.worst in "BC"
     assert np.isfinite(partly.rms_px)

@@ -305,7 +305,9 @@ def check(session: Path, as_json: bool) -> None:
     type=click.Path(path_type=Path, dir_okay=False),
     help="Write a picture of it instead; needs no display.",
 )
-@click.option("--station", type=int, help="Station to show; the worst used by default.")
+@click.option(
+    "--station", type=int, help="Station to show instead of the one named below."
+)
 @click.option("--step", type=int, help="Solver step to show instead, from 0.")
 @click.option(
     "--blueprint",
@@ -323,7 +325,7 @@ def replay(
 ) -> None:
     """Show a session's recording.
 
-    First comes the worst station that was used.
+    It begins at a station that the first finding is about, else at the worst used.
     """
     if serve and (station, step, blueprint) != (None, None, None):
         raise click.UsageError(

@@ -71,11 +71,14 @@ def assess(
         touch_gate(),
     )
     radius = 1e3 * float(np.mean(radius_95(track.predicted_covariance)))
-    verdict = judge(
-        gates,
-        f"Where the robot says a marker is and where the cameras see it agree within "
-        f"{radius:.2f} mm (95 %, predicted).",
-    )
+    places = "Where the robot says a marker is and where the cameras see it"
+    verdict = judge(gates, f"{places} agree within {radius:.2f} mm (95 %, predicted).")
+    if verdict.outcome != "PASS":
+        sentence = (
+            f"{places} are up to {1e3 * track.max:.2f} mm apart; {radius:.2f} mm "
+            "(95 %) was predicted."
+        )
+        verdict = replace(verdict, sentence=sentence)
     dropped = cameras.details.get("dropped", ())
     if not dropped:
         return verdict

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
-from handeye_tri.records import HandEyeCalibration, Session
+from handeye_tri.records import DroppedHalfTurn, HandEyeCalibration, Session
 from handeye_tri.se3 import hat
 from handeye_tri.triangle import VERTICES
 
 Floats = NDArray[np.float64]
-ViewCode = Literal["", "FAR", "UNSEEN"]
+ViewCode = Literal["", "FAR", "UNSEEN", "LEFT OUT"]
 
 # A residual of two normal components is longer than this many sigmas in one view of
 # 25,000: exp(-4.5^2 / 2).
@@ -35,7 +36,8 @@ class ViewCheck:
         worst_px: Its distance, px.
         worst_sigmas: Its distance in standard deviations that pixel noise and the
             robot's repeatability explain (the calibration's own is left out).
-        code: "FAR" beyond 4.5 sigmas, else "UNSEEN" where a marker is missing.
+        code: "FAR" beyond 4.5 sigmas, else "UNSEEN" where a marker is missing; "LEFT
+            OUT" where calibration dropped the half-turn that the view belongs to.
     """
 
     camera: str
@@ -71,12 +73,20 @@ def predicted_pixels(calibration: HandEyeCalibration, session: Session) -> Float
 
 
 def check_views(
-    calibration: HandEyeCalibration, session: Session
+    calibration: HandEyeCalibration,
+    session: Session,
+    dropped: Sequence[DroppedHalfTurn] = (),
 ) -> tuple[ViewCheck, ...]:
     """Every view with its residual, the most unlikely first.
 
     Views in which nothing was seen come last; by camera and station where equal.
+
+    Args:
+        calibration: The calibrated cell.
+        session: What was observed, without what was dropped.
+        dropped: Half-turns that calibration left out.
     """
+    left_out = {(one.camera, j) for one in dropped for j in (one.before, one.after)}
     residuals = session.pixels - predicted_pixels(calibration, session)
     expected = session.pixel_covariance + _by_robot(calibration, session)
     held_out = set(session.indices("evaluation").tolist())
@@ -94,6 +104,8 @@ def check_views(
             k = int(np.argmax(sigmas))
             unseen = "".join(VERTICES[k] for k in np.flatnonzero(~seen))
             code: ViewCode = "UNSEEN" if unseen else ""
+            if (camera.name, j) in left_out:
+                code = "LEFT OUT"
             checks.append(
                 ViewCheck(
                     camera=camera.name,

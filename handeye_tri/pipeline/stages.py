@@ -213,6 +213,7 @@ def _report(run: Run) -> tuple[list[str], str]:
         truth=truth[0] if truth else None,
         evaluation=evaluation,
         steps=solver_steps(session, run.cameras(), hand_eye),
+        dropped=run.cameras().details["dropped"],
     )
     header = run.folder.header
     page = render_report(

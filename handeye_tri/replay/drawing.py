@@ -180,7 +180,7 @@ def log_gaps(
                 radii=[width],
             ),
         )
-    words = "not seen"
+    words = "no gap"
     if seen.any():
         k = int(np.nanargmax(millimetres))
         words = f"{'ABC'[k]} {millimetres[k]:.3f} mm"

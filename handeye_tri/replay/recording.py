@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from handeye_tri.errors import InputError, StorageError
 from handeye_tri.mechanism import Mechanism
 from handeye_tri.records import (
+    DroppedHalfTurn,
     GroundTruth,
     HandEyeCalibration,
     Session,
@@ -65,6 +66,7 @@ def write_recording(
     truth: GroundTruth | None,
     evaluation: Mapping[str, Any],
     steps: Sequence[SolverStep] = (),
+    dropped: Sequence[DroppedHalfTurn] = (),
 ) -> None:
     """Write the recording of a calibrated session, whole or not at all.
 
@@ -85,6 +87,7 @@ def write_recording(
         truth: Of a simulated session.
         evaluation: The content of ``evaluation.json``.
         steps: By which the calibration was reached, without the last one.
+        dropped: Half-turns that it left out.
 
     Raises:
         InputError: poses, stations and track do not fit each other.
@@ -96,7 +99,12 @@ def write_recording(
             f"world_from_body must have shape ({n}, {len(mechanism.bodies)}, 4, 4) "
             f"for these stations and bodies, got {world_from_body.shape}"
         )
-    story = tell(session, calibration, track, truth, steps)
+    first = next(iter(evaluation["findings"]), {"stations": ()})
+    story = tell(
+        *(session, calibration, track, truth, steps),
+        dropped=dropped,
+        about=first["stations"],
+    )
     look = layout(calibration, story, base_from_world)
     tracked = {int(j): k for k, j in enumerate(np.flatnonzero(story.held_out))}
     with recorded(path, name, look) as recording:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from handeye_tri.errors import InputError
 from handeye_tri.evaluate.views import ViewCheck, check_views, predicted_pixels
 from handeye_tri.records import (
+    DroppedHalfTurn,
     GroundTruth,
     HandEyeCalibration,
     Session,
@@ -70,7 +71,8 @@ class Story:
             centre, shape (m, n, 3, 2), pixels.
         turns: Per camera and station, the half-turn that the station belongs to;
             without lines where it belongs to none.
-        shown: The station that is shown first: the used one with the largest gap.
+        shown: The station that is shown first: one that the first finding is about, or
+            the used one with the largest gap.
         checks: Every view against what is predicted for it, most unlikely first.
         slides: Solver steps, the last one as calibrated.
         ellipsoids: One per camera.
@@ -143,6 +145,9 @@ def tell(
     track: TrackEvaluation,
     truth: GroundTruth | None,
     steps: Sequence[SolverStep] = (),
+    *,
+    dropped: Sequence[DroppedHalfTurn] = (),
+    about: Sequence[int] = (),
 ) -> Story:
     """Prepare a session for drawing.
 
@@ -152,6 +157,8 @@ def tell(
         track: Its held-out track; these very positions are drawn.
         truth: Of a simulated session.
         steps: By which the calibration was reached, without the last one.
+        dropped: Half-turns that it left out.
+        about: Stations that the first finding is about, none where it is about all.
 
     Raises:
         InputError: the track is not of this session.
@@ -180,7 +187,10 @@ def tell(
             markers = truth.flange_from_triangle.apply(session.triangle.points)
         actual = _move(truth.base_from_flange, markers)
     predicted = predicted_pixels(calibration, session)
-    shown = _worst_used(observed - reported, held_out, worst_station(track))
+    gaps = observed - reported
+    shown = _worst_of(gaps, about)
+    if shown is None:
+        shown = _worst_used(gaps, held_out, worst_station(track))
     slides, slide = slides_of(session, calibration, steps, shown)
     ellipsoids, larger = _ellipsoids(calibration, truth)
     return Story(
@@ -194,14 +204,21 @@ def tell(
             for i, camera in enumerate(calibration.cameras)
         ),
         shown=shown,
-        checks=check_views(calibration, session),
+        checks=check_views(calibration, session, dropped),
         slides=slides,
         ellipsoids=ellipsoids,
-        magnification=magnification(observed - reported, _LONGEST_ARROW),
+        magnification=magnification(gaps, _LONGEST_ARROW),
         magnification_px=magnification(session.pixels - predicted, _LONGEST_ARROW_PX),
         magnification_slide=slide,
         magnification_ellipsoid=larger,
     )
+
+
+def _worst_of(gaps: Floats, stations: Sequence[int]) -> int | None:
+    """The first of these stations with the largest gap; None of none."""
+    lengths = np.linalg.norm(gaps, axis=-1)
+    sizes = [float(np.nanmax(lengths[j], initial=-1.0)) for j in stations]
+    return int(stations[int(np.argmax(sizes))]) if sizes else None
 
 
 def _worst_used(gaps: Floats, held_out: NDArray[np.bool_], otherwise: int) -> int:

@@ -125,7 +125,7 @@ def serve(
     Raises:
         InputError: the port is taken, or the recording is none of ours.
     """
-    read_numbers(recording)
+    shown = read_numbers(recording)["shown_station"]
     if not _is_free(port):
         raise InputError(
             f"port {port} of {_LOOPBACK} is in use; end what uses it, or give another"
@@ -139,6 +139,8 @@ def serve(
     with _running(command) as process:
         (announce or _to_stderr)(
             f"open http://{_LOOPBACK}:{port}?url={source} in a browser"
+            # A page cannot be told where to begin: it follows what it loads.
+            + ("" if shown is None else f" and go to station {shown}, bottom right")
         )
         process.wait()
 

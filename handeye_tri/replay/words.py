@@ -72,7 +72,7 @@ def verdict_markdown(
         evaluation["sentence"],
         "",
         *_findings(evaluation["findings"]),
-        f"**Look at** {_look_at(story)}",
+        f"**Look at** {look_at(story, evaluation['findings'])}",
         "",
         f"Held-out track: {held_out['mean_mm']:.3f} mm mean, "
         f"{held_out['rms_mm']:.3f} rms (predicted {held_out['predicted_rms_mm']:.3f}); "
@@ -88,15 +88,23 @@ def verdict_markdown(
     return "\n".join(lines)
 
 
-def _look_at(story: Story) -> str:
-    """The station on screen, and what is to be seen there."""
+def look_at(story: Story, findings: Sequence[Mapping[str, Any]]) -> str:
+    """The station on screen, and what is to be seen there.
+
+    Args:
+        story: What is drawn.
+        findings: What is wrong, first first, as in ``evaluation.json``.
+    """
     j = story.shown
     marker, gap = story.worst(j)
     kind = "the worst station that was held out"
-    if not story.held_out[j]:
+    if findings and j in findings[0]["stations"]:
+        kind = f"where {findings[0]['code']} was found"
+    elif not story.held_out[j]:
         kind = "the worst that the calibration used"
     text = f"**station {j}**, {kind}: "
-    text += f"marker {marker} is {gap:.3f} mm off." if marker else "no marker seen."
+    text += f"marker {marker} is {gap:.3f} mm off" if marker else _unseen(story, j)
+    text += "."
     views = [check for check in story.checks if check.station == j and check.worst]
     if views:
         view = views[0]
@@ -105,6 +113,12 @@ def _look_at(story: Story) -> str:
             f"{view.worst_px:.3f} px ({view.worst_sigmas:.1f} sigmas)."
         )
     return text
+
+
+def _unseen(story: Story, j: int) -> str:
+    """Why a station has no gap."""
+    codes = {check.code for check in story.checks if check.station == j}
+    return "left out" if "LEFT OUT" in codes else "no marker seen"
 
 
 def _findings(findings: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -258,7 +272,10 @@ def log_lines(story: Story, evaluation: Mapping[str, Any]) -> list[LogLine]:
             lines.append(LogLine(0, level, f"All stations: {text}"))
         lines += [LogLine(int(j), level, text) for j in stations]
     for check in story.checks:
-        if check.unseen:
+        if check.code == "LEFT OUT":
+            text = f"{check.camera} was left out of the calibration"
+            lines.append(LogLine(check.station, "WARN", text))
+        elif check.unseen:
             text = f"{check.camera} does not see {', '.join(check.unseen)}"
             lines.append(LogLine(check.station, "WARN", text))
         if check.code == "FAR":
@@ -270,6 +287,6 @@ def log_lines(story: Story, evaluation: Mapping[str, Any]) -> list[LogLine]:
     for j, held_out in enumerate(story.held_out):
         marker, gap = story.worst(j)
         kind = "held out" if held_out else "used"
-        text = f"{kind}: {marker} {gap:.3f} mm" if marker else f"{kind}: not seen"
+        text = f"{kind}: {f'{marker} {gap:.3f} mm' if marker else _unseen(story, j)}"
         lines.append(LogLine(j, "INFO", text))
     return sorted(lines, key=lambda line: line.station)

@@ -73,7 +73,7 @@ def render_report(
             worst views; None where there are no images.
     """
     predicted = predicted_pixels(calibration, session)
-    checks = check_views(calibration, session)
+    checks = check_views(calibration, session, cameras.details.get("dropped", ()))
     radii = (1e3 * radius_95(track.predicted_covariance)).tolist()
     arrows, factor = figures.residual_maps(session, predicted)
     drawings = {

@@ -11,10 +11,11 @@ from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
 from handeye_tri.errors import InputError
 from handeye_tri.evaluate import cross_validate
 from handeye_tri.evaluate.resampling import drawn
+from handeye_tri.records import DroppedHalfTurn
 from handeye_tri.replay.half_turns import HalfTurnView, half_turn_view
 from handeye_tri.replay.shapes import vertex_normals
 from handeye_tri.replay.story import tell, worst_station
-from handeye_tri.replay.words import verdict_markdown
+from handeye_tri.replay.words import look_at, verdict_markdown
 from handeye_tri.triangle import AXES
 
 
@@ -150,6 +151,26 @@ def test_worst_station_is_the_one_with_the_largest_error():
     assert worst_station(done.track) == done.track.stations[row]
 
 
+def test_a_station_that_the_first_finding_is_about_is_shown():
+    done = finished()
+    findings = [{"code": "SLIP", "stations": [2, 3]}]
+    arguments = (done.session, done.calibration, done.track, None)
+    story = tell(*arguments, about=findings[0]["stations"])
+    worst = np.nanmax(story.distances_mm[[2, 3]], axis=1).argmax() + 2
+    assert story.shown == worst
+    assert f"**station {worst}**, where SLIP was found" in look_at(story, findings)
+    # What was left out has no gap, and is shown all the same.
+    turn = done.session.half_turns[1]
+    lost = [
+        DroppedHalfTurn(camera.name, 1, turn.before, turn.after, "stale")
+        for camera in done.session.cameras
+    ]
+    used = done.session.without(lost)
+    told = tell(*(used, *arguments[1:]), dropped=lost, about=[turn.before, turn.after])
+    assert told.shown == turn.before
+    assert look_at(told, []).endswith("left out.")
+
+
 def test_without_a_used_station_the_worst_held_out_is_shown():
     done = finished()
     pixels = done.session.pixels.copy()
@@ -178,7 +199,7 @@ def test_the_verdict_names_station_gates_and_source():
         "gates": [{"verdict": "bad"}, {"verdict": "good"}, {"verdict": "not run"}],
         "findings": [
             {"code": "SLIP", "cause": "slid", "evidence": "2 mm", "remedy": "look"}
-            | {"follows": ""},
+            | {"follows": "", "stations": []},
             {"code": "LOOP", "follows": "SLIP"},
         ],
         "track": {

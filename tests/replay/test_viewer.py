@@ -27,6 +27,7 @@ from handeye_tri.replay import (
     viewer,
     write_recording,
 )
+from handeye_tri.replay.recording import read_numbers
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +154,8 @@ def test_serving_stays_on_loopback_and_says_where(recording, tmp_path, monkeypat
     port = viewer._free_port()
     serve(recording, port, told.append)
     assert told[0].startswith(f"open http://127.0.0.1:{port}?url=rerun%2Bhttp%3A%2F%2F")
+    shown = read_numbers(recording)["shown_station"]
+    assert told[0].endswith(f" in a browser and go to station {shown}, bottom right")
     arguments = (tmp_path / "arguments").read_text().split()
     assert arguments[arguments.index("--bind") + 1] == "127.0.0.1"
     assert arguments[-1] == str(recording)

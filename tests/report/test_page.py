@@ -146,7 +146,7 @@ def test_findings_say_where_and_what_follows_from_them_comes_last(undrawn):
     text = text_of(page(changes={"findings": [asdict(one) for one in findings]}))
     assert "SLIP c (stations 4, 6)" in text
     assert "POOR p (camera left)" in text
-    assert text.index("POOR p") < text.index("LOOP likely follows from SLIP: l; 4.2.")
+    assert text.index("POOR p") < text.index("Likely follows from SLIP: LOOP l; 4.2.")
     assert "Do: mend" not in text
     assert "SLIP, POOR; what follows from them: LOOP" in text
 
