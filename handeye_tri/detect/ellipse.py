@@ -42,6 +42,24 @@ _BEHIND_SIGMAS = 1.5
 _MAX_SURPLUS = 0.1
 # Harmonics of the edge's residual that tell its noise: the fit absorbs 0, 1 and 2.
 _NOISE_HARMONICS = np.arange(3, 11)
+# White noise of the sensor is in the background too, a median over five directions: an
+# error there moves neighbouring edges together. At the k-th harmonic it adds to the
+# edge's own noise, of power 1, ...
+_TOGETHER = 5
+_MOVED_TOGETHER = (
+    np.sin(_TOGETHER * np.pi * np.arange(1, 11) / RAYS)
+    / (_TOGETHER * np.sin(np.pi * np.arange(1, 11) / RAYS))
+) ** 2
+# ... this times the edge's blur in px times R over the radius of the ring in which the
+# background is read: sqrt(pi) / 2 by the integrals of a normal edge, 1.43 for the
+# variance of a median of five over that of their mean, and 2.35 px for how wide a ring
+# its three samples see.
+_BY_BACKGROUND = 0.5 * np.sqrt(np.pi) * 1.43 / 2.35
+# The ring begins so many sigmas of the blur behind the edge, and its middle is so much
+# farther, px; sampling between pixels widens the edge by the variance, px^2.
+RING_START = 1.75
+RING_MIDDLE = 0.9
+SAMPLING_VARIANCE = 1.0 / 6.0
 # Each has a sine and a cosine: so many numbers does a scatter come from.
 SCATTER_NUMBERS = 2 * len(_NOISE_HARMONICS)
 
@@ -239,10 +257,13 @@ def fit_ellipses(
     # White noise of variance v in each of k directions has the power k v.
     many = np.maximum(noisy.sum(axis=1), 1)
     power *= ((information * noisy).sum(axis=1) / many**2)[:, None]
-    sensor = np.minimum(noise**2, power.mean(axis=1))
+    white = 1.0 + _background_share(ellipses) * _MOVED_TOGETHER
+    tail = white[:, _NOISE_HARMONICS - 1]
+    sensor = np.minimum(noise**2, (power / tail).mean(axis=1))
     smooth = (ellipses[:, 5:] / ellipses[:, 2:3]) ** 2
     passed = np.exp(-smooth * _NOISE_HARMONICS**2)
-    stairs = (passed * (power - sensor[:, None])).sum(axis=1) / (passed**2).sum(axis=1)
+    beyond = power - sensor[:, None] * tail
+    stairs = (passed * beyond).sum(axis=1) / (passed**2).sum(axis=1)
     expected = (noise**2)[:, None] * shown / np.maximum(information, least)
     expected = expected.sum(axis=1) / count
     gain = np.empty((m, 2, 2))
@@ -253,13 +274,20 @@ def fit_ellipses(
     return EllipseFit(
         ellipses,
         gain,
-        sensor + np.maximum(stairs, 0.0) * np.exp(-smooth[:, 0]),
+        sensor * white[:, 0] + np.maximum(stairs, 0.0) * np.exp(-smooth[:, 0]),
         np.sqrt(np.maximum((kept**2).sum(axis=1) / count - expected, 0.0)),
         shown.mean(axis=1),
         (offered & (out < -limit)).mean(axis=1),
         (offered & (np.abs(out) > limit)).mean(axis=1),
         _edge_variances(edge, ellipses, left, jacobian[5], own),
     )
+
+
+def _background_share(ellipses: Floats) -> Floats:
+    """What noise of the background adds to that of an edge far along it, (m, 1)."""
+    blur, size = ellipses[:, 5:], ellipses[:, 2:3]
+    ring = RING_START * np.sqrt(blur**2 + SAMPLING_VARIANCE) + RING_MIDDLE
+    return np.asarray(_BY_BACKGROUND * blur * size / (size + ring))
 
 
 def _edge_variances(

@@ -18,6 +18,9 @@ from handeye_tri.detect.ellipse import (
     BLUR_RANGE,
     MAD,
     RAYS,
+    RING_MIDDLE,
+    RING_START,
+    SAMPLING_VARIANCE,
     SCATTER_NUMBERS,
     Flags,
     Indices,
@@ -53,9 +56,7 @@ _MIN_CONTRAST = 12.0
 _MIN_CONTRAST_SIGMAS = 5.0
 # The background is read so far behind the end of the edge, px, and its median taken
 # over neighbouring directions.
-_RING_START = 1.75
-_RING = np.array([0.3, 0.9, 1.5])
-_SAMPLING_VARIANCE = 1.0 / 6.0
+_RING = RING_MIDDLE + np.array([-0.6, 0.0, 0.6])
 _DIRECTIONS = np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=-1)
 _NEAR = (np.arange(RAYS)[:, None] + np.arange(-2, 3)) % RAYS
 # A change of the background by this part of the contrast makes an edge unusable.
@@ -282,8 +283,8 @@ def _background(
         too like the marker.
     """
     # Sampling between pixels blurs the edge a little more.
-    blur = np.sqrt(ellipses[:, 5] ** 2 + _SAMPLING_VARIANCE)[:, None]
-    distance = _RING_START * blur + _RING
+    blur = np.sqrt(ellipses[:, 5] ** 2 + SAMPLING_VARIANCE)[:, None]
+    distance = RING_START * blur + _RING
     radii = radii_by_direction(ellipses)[..., None] + distance[:, None]
     points = ellipses[:, None, None, :2] + radii[..., None] * _DIRECTIONS[:, None]
     values = sampler(spots, points)
