@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri.counting import counted
 from handeye_tri.diagnose import Verdict, assess_pose_pairs
 from handeye_tri.errors import ConvergenceError
 from handeye_tri.hand_eye import (
@@ -133,7 +134,7 @@ def _verdict_lines(solved: SolvedPairs) -> list[str]:
         for key in ("name", "found", "limit")
     )
     lines = [
-        f"VERDICT  {verdict.outcome}      {len(solution.poses)} poses, "
+        f"VERDICT  {verdict.outcome}      {counted(len(solution.poses), 'pose')}, "
         f"{solved.pairs.mounting.replace('_', '-')}, {len(met)} of {len(ran)} gates "
         f"met, {len(gates) - len(ran)} not run",
         *wrapped(verdict.sentence),

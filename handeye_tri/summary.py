@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.camera import INTRINSIC_NAMES
+from handeye_tri.counting import counted
 from handeye_tri.records import GroundTruth, HandEyeCalibration, Plan, motion_labels
 from handeye_tri.se3 import SE3, so3_left_jacobian_inverse, so3_log
 
@@ -95,8 +96,9 @@ def plan_text(plan: Plan, cell: str) -> str:
     held_out = sum(station.kind == "evaluation" for station in plan.stations)
     lines = [
         f"VERDICT  {plan.outcome}      cell {cell}, before the robot moves",
-        f"  {len(plan.half_turns)} half-turns, {len(plan.stations) - held_out} "
-        f"stations + {held_out} held out; {number['cycle_time_s']:.1f} s of moves",
+        f"  {counted(len(plan.half_turns), 'half-turn')}, "
+        f"{counted(len(plan.stations) - held_out, 'station')} + {held_out} held out; "
+        f"{number['cycle_time_s']:.1f} s of moves",
         f"  Track error over the workspace box: {number['track_predicted_rms_mm']:.3f} "
         "mm rms expected,",
         f"  of which {number['track_calibration_rms_mm']:.3f} from the calibration"
@@ -106,7 +108,7 @@ def plan_text(plan: Plan, cell: str) -> str:
             if "relaxed_bound_mm" in number
             else ""
         ),
-        f"  Planes {number['plane_spread_deg']:.0f} deg apart; axes "
+        f"  Planes up to {number['plane_spread_deg']:.0f} deg apart; axes "
         f"{number['axis_spread']:.2f} of 1; rank {number['rank']:.0f} of "
         f"{number['unknowns']:.0f}; condition {number['condition']:.1e}",
         f"  Assumed: centres to {number['sigma_px']} px; cameras, rig and robot as the "
@@ -221,8 +223,9 @@ def against_prediction_text(track: Mapping[str, Any]) -> str:
 def tested_stations(track: Mapping[str, Any]) -> str:
     """Which stations the track test was made at, in words."""
     if track["source"] == "cross-validation":
-        return f"{track['stations']} stations, each left out of its own calibration"
-    return f"{track['stations']} held-out stations"
+        stations = counted(track["stations"], "station")
+        return f"{stations}, each left out of its own calibration"
+    return counted(track["stations"], "held-out station")
 
 
 def cross_check_lines(evaluation: Mapping[str, Any]) -> list[str]:

@@ -16,7 +16,7 @@ PACKAGE = REPO / "handeye_tri"
 
 # A module imports only from rows before its own. A folder is one module.
 ROWS: tuple[tuple[str, ...], ...] = (
-    ("errors", "threads"),
+    ("errors", "threads", "counting"),
     ("se3",),
     ("camera", "triangle"),
     ("records",),

@@ -18,6 +18,7 @@ from handeye_tri.calibrate_cameras.closed_form import NOMINAL_FOCAL
 from handeye_tri.calibrate_cameras.half_turns import HalfTurnData
 from handeye_tri.calibrate_cameras.homography import Homographies, vanishing_lines
 from handeye_tri.calibrate_cameras.special_motion import foot_fraction
+from handeye_tri.counting import counted
 from handeye_tri.errors import DegenerateMotionError
 from handeye_tri.triangle import EDGES, VERTICES, Axis, TriangleRig
 
@@ -67,7 +68,8 @@ def check_count(n: int, intrinsics: int, unknowns: int, per_half_turn: int) -> N
         if intrinsics == 5 and n == 2 and unknowns - 1 < n * per_half_turn:
             remedy += ", or fix the skew at zero (skew=False), for which 2 are enough"
         raise DegenerateMotionError(
-            f"{n} half-turns are too few for {unknowns} unknowns of camera and axis"
+            f"{counted(n, 'half-turn')} {'is' if n == 1 else 'are'} too few for "
+            f"{unknowns} unknowns of camera and axis"
             f"{' with skew' if intrinsics == 5 else ''}: at least {needed} are needed, "
             f"because each gives 2 constraints on K; {remedy}"
         )

@@ -11,6 +11,7 @@ import click
 
 from handeye_tri.cli.group import EXIT_CODES, SESSION, commands, example
 from handeye_tri.cli.progress import cap_threads
+from handeye_tri.counting import counted
 
 
 @commands.command(epilog=example("handeye-tri compare january july", "echo $?"))
@@ -64,7 +65,8 @@ def _text(compared: Mapping[str, Any]) -> str:
             subsequent_indent="  ",
             break_on_hyphens=False,
         ),
-        f"  The calibration of before places {placed['points']} markers seen after "
+        f"  The calibration of before places "
+        f"{counted(placed['points'], 'marker')} seen after "
         f"{placed['rms_mm']:.3f} mm rms off,",
         f"  {placed['max_mm']:.3f} at worst; noise alone gives "
         f"{placed['expected_rms_mm']:.3f} rms; the cell allows "

@@ -10,6 +10,7 @@ import click
 
 from handeye_tri.cli.group import AGAIN, EXIT_CODES, SESSION, commands, example
 from handeye_tri.cli.progress import StderrProgress, cap_threads
+from handeye_tri.counting import counted
 
 if TYPE_CHECKING:
     from handeye_tri.pipeline import Run
@@ -161,7 +162,7 @@ def _plan_more(session: Path, more: int) -> None:
     finally:
         progress.close()
     click.echo(plan_text(made, run.cell.name))
-    click.echo(f"\nWROTE  {path}  {len(made.stations)} stations")
+    click.echo(f"\nWROTE  {path}  {counted(len(made.stations), 'station')}")
     sys.exit(EXIT_CODES[made.outcome])
 
 

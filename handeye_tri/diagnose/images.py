@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri.counting import counted
 from handeye_tri.diagnose.gates import Finding
 from handeye_tri.diagnose.loop import Fit, Loop
 from handeye_tri.records import Session
@@ -142,7 +143,8 @@ def _poor_detection(
         "DETECTION",
         "markers are found poorly, or not at all",
         f"{missing} of {markers} markers missing; sigma {usual:.3f} px at the median "
-        f"view, {sigma.max():.3f} at the worst, above {limit:.2f} in {len(poor)} views",
+        f"view, {sigma.max():.3f} at the worst, above {limit:.2f} in "
+        f"{counted(len(poor), 'view')}",
         "warning",
         "more and even light, focus, larger or more saturated markers, less gain; "
         "nothing before the markers",

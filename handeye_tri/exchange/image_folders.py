@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri.counting import counted
 from handeye_tri.errors import InputError
 from handeye_tri.exchange.capture import MAX_POSES, Capture, ImageStream, Picture, Shot
 from handeye_tri.exchange.pose_tables import PoseTable
@@ -83,7 +84,8 @@ def paired_stations(table: PoseTable, images: Mapping[str, list[Path]]) -> Captu
     for camera, paths in images.items():
         if len(paths) != len(poses):
             raise InputError(
-                f"there are {len(poses)} poses and {len(paths)} images of {camera}; "
+                f"{counted(len(poses), 'pose')} and {counted(len(paths), 'image')} of "
+                f"{camera}; "
                 "without names the i-th of both must belong together: add a first "
                 "column called image or station to the poses"
             )

@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from handeye_tri.counting import counted
 from handeye_tri.errors import InputError, StorageError
 from handeye_tri.exchange.capture import MAX_POSES
 from handeye_tri.records import Floats, RobotDirection
@@ -248,7 +249,7 @@ def _need_columns(
     for line, cells in rows:
         if len(cells) not in counts:
             raise reader.fail(
-                f"line {line} has {len(cells)} columns; {what} has "
+                f"line {line} has {counted(len(cells), 'column')}; {what} has "
                 f"{' or '.join(map(str, counts))}"
             )
 
@@ -259,8 +260,8 @@ def _check_euroc(
     for line, cells in rows:
         if len(cells) < 8:
             raise reader.fail(
-                f"line {line} has {len(cells)} columns; EuRoC/ASL poses have at least "
-                "8: timestamp [ns], p_x p_y p_z [m], q_w q_x q_y q_z"
+                f"line {line} has {counted(len(cells), 'column')}; EuRoC/ASL poses "
+                "have at least 8: timestamp [ns], p_x p_y p_z [m], q_w q_x q_y q_z"
             )
     named = " ".join(header)
     if header and ("[ns]" not in header[0].replace(" ", "") or "[m]" not in named):
@@ -286,7 +287,7 @@ def _key_columns(
     first = len(rows[0][1])
     if first not in counts and not keys:
         raise reader.fail(
-            f"line {rows[0][0]} has {first} columns, {layout.rotation} has "
+            f"line {rows[0][0]} has {counted(first, 'column')}, {layout.rotation} has "
             f"{' or '.join(map(str, layout.counts))}; where a first column names the "
             f"pose, add a header line that calls it {', '.join(_KEYS)}"
         )

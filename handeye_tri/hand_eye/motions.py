@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handeye_tri.counting import counted
 from handeye_tri.errors import InputError
 from handeye_tri.se3 import quaternion_wxyz, se3_inverse
 
@@ -72,7 +73,9 @@ def check_motions(name: str, motions: ArrayLike, least: int) -> Floats:
     if m.ndim != 3 or m.shape[1:] != (4, 4):
         raise InputError(f"{name} must have shape (n, 4, 4), got {m.shape}")
     if len(m) < least:
-        raise InputError(f"{name} holds {len(m)} motions; at least {least} are needed")
+        raise InputError(
+            f"{name} holds {counted(len(m), 'motion')}; at least {least} are needed"
+        )
     # A sum is finite only if all its terms are.
     if not np.isfinite(m.sum()) and not np.isfinite(m).all():
         bad = ~np.isfinite(m).all(axis=(1, 2))
@@ -135,7 +138,7 @@ def check_pairs(a: ArrayLike, b: ArrayLike, least: int) -> tuple[Floats, Floats]
     first, second = check_motions("a", a, least), check_motions("b", b, least)
     if len(first) != len(second):
         raise InputError(
-            f"a holds {len(first)} motions and b {len(second)}; "
+            f"a holds {counted(len(first), 'motion')} and b {len(second)}; "
             "a[i] and b[i] must belong together"
         )
     return first, second

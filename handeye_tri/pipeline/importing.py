@@ -11,6 +11,7 @@ import numpy as np
 
 from handeye_tri import storage
 from handeye_tri.config import Cell, CellToCalibrate
+from handeye_tri.counting import counted
 from handeye_tri.errors import InputError
 from handeye_tri.exchange.capture import Capture
 from handeye_tri.exchange.half_turns import (
@@ -112,7 +113,7 @@ def import_session(
     lines += [f"note: {remark}" for remark in capture.remarks]
     test = ", ".join(map(str, held_out)) or "none: half-turns are held out in turn"
     return [
-        f"{len(capture.shots)} stations, {len(images)} images",
+        f"{counted(len(capture.shots), 'station')}, {counted(len(images), 'image')}",
         *lines,
         f"held out for the test: {test} (--held-out)",
     ]
@@ -130,7 +131,7 @@ def _half_turns(
     else:
         found = find_half_turns(base_from_flange, corrections.tolerance)
     lines = [
-        f"{len(found.turns)} half-turns about {cell.rig.axis} "
+        f"{counted(len(found.turns), 'half-turn')} about {cell.rig.axis} "
         f"{'as named' if named else 'found in the poses'} (--half-turns):"
     ]
     lines += [
@@ -141,8 +142,9 @@ def _half_turns(
     lines += [f"  not {text}" for text in found.others]
     if len(found.turns) < _LEAST_TURNS:
         raise InputError(
-            f"{len(found.turns)} half-turns among {len(base_from_flange)} stations, at "
-            f"least {_LEAST_TURNS} are needed; "
+            f"{counted(len(found.turns), 'half-turn')} among "
+            f"{counted(len(base_from_flange), 'station')}, at least "
+            f"{_LEAST_TURNS} are needed; "
             + ("; ".join(found.others[:3]) + "; " if found.others else "")
             + "name them with --half-turns, or widen --turn-tolerance"
         )

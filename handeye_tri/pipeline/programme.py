@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from handeye_tri import storage
+from handeye_tri.counting import counted
 from handeye_tri.errors import InputError
 from handeye_tri.exchange.robot_programme import (
     Programme,
@@ -124,8 +125,8 @@ def _programme(run: Run, plan: Plan, start: Floats, dwell: float) -> Programme:
     outcome = f"verdict {plan.outcome}: " + ("; ".join(plan.findings) or "no finding")
     return Programme(
         head=(
-            f"handeye-tri: {len(plan.half_turns)} half-turns of cell {cell.name}, "
-            f"seed {plan.seed}",
+            f"handeye-tri: {counted(len(plan.half_turns), 'half-turn')} of cell "
+            f"{cell.name}, seed {plan.seed}",
             outcome,
             "Planned in the model of the cell: try it slowly, a hand on the stop.",
         ),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from handeye_tri import storage
 from handeye_tri.config import Cell, CellToCalibrate, parse_any_cell
+from handeye_tri.counting import counted
 from handeye_tri.errors import InputError
 from handeye_tri.exchange.capture import Capture, PoseStream, Stillness
 from handeye_tri.exchange.image_folders import (
@@ -287,7 +288,7 @@ def _forward(cell: Cell, model: Path, joints: Sequence[str]) -> Forward:
     names = tuple(joints) or arm.joint_names
     if len(names) != len(arm.joint_names) or len(set(names)) < len(names):
         raise InputError(
-            f"--joints must name {len(arm.joint_names)} joints in the order of "
-            f"{', '.join(arm.joint_names)}; got {', '.join(names)}"
+            f"--joints must name {counted(len(arm.joint_names), 'joint')} in the order "
+            f"of {', '.join(arm.joint_names)}; got {', '.join(names)}"
         )
     return Forward(names, arm.forward)

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from handeye_tri import storage
+from handeye_tri.counting import counted
 from handeye_tri.errors import InputError, StorageError
 from handeye_tri.pipeline.drawn_robot import drawn_robot
 from handeye_tri.pipeline.evaluation import evaluate, judged_track
@@ -46,8 +47,9 @@ def _plan(run: Run) -> tuple[list[str], str]:
     )
     held_out = sum(s.kind == "evaluation" for s in plan.stations)
     return ["plan.json"], (
-        f"{len(plan.half_turns)} half-turns, {len(plan.stations) - held_out} stations "
-        f"+ {held_out} held out, {plan.certificate['cycle_time_s']:.0f} s; expect "
+        f"{counted(len(plan.half_turns), 'half-turn')}, "
+        f"{counted(len(plan.stations) - held_out, 'station')} + {held_out} held out, "
+        f"{plan.certificate['cycle_time_s']:.0f} s; expect "
         f"{plan.certificate['track_predicted_rms_mm']:.3f} mm rms; {plan.outcome}"
     )
 
@@ -101,7 +103,9 @@ def _simulate(run: Run) -> tuple[list[str], str]:
             future.result()
     mark.unlink()
     outputs = ["truth.json", *(run.image_name(names[i], j) for i, j in views)]
-    return outputs, f"{len(plan.stations)} stations, {len(views)} images"
+    return outputs, (
+        f"{counted(len(plan.stations), 'station')}, {counted(len(views), 'image')}"
+    )
 
 
 def _detect(run: Run) -> tuple[list[str], str]:
@@ -156,7 +160,7 @@ def _cameras(run: Run) -> tuple[list[str], str]:
     )
     line = (
         f"{', '.join(camera.name for camera in result.cameras)} from "
-        f"{len(run.plan().half_turns)} half-turns; "
+        f"{counted(len(run.plan().half_turns), 'half-turn')}; "
         f"chi2/dof {result.chi2 / result.dof:.2f} (1 = noise as assumed)"
     )
     for one in result.details["dropped"]:
@@ -182,7 +186,7 @@ def _hand_eye(run: Run) -> tuple[list[str], str]:
             f", {len(result.robot)} of {len(parameters.labels)} errors of the robot"
         )
     return ["hand_eye.json"], (
-        f"{run.method}, {len(result.residuals)} stations{errors}; "
+        f"{run.method}, {counted(len(result.residuals), 'station')}{errors}; "
         f"loop {translation:.3f} mm {rotation:.4f} deg; "
         f"chi2/dof {result.chi2 / result.dof:.2f}"
     )

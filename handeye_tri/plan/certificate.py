@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.config import Cell
+from handeye_tri.counting import counted
 from handeye_tri.plan.design import Design
 from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import HALF_TURN, View, plane_angles
@@ -66,7 +67,8 @@ def certify(
     The numbers are
 
     * ``sigma_px``: the detection error that the predictions assume,
-    * ``plane_spread_deg``: largest angle between planes of two half-turns,
+    * ``plane_spread_deg``: largest angle between the triangle's planes at two
+      half-turns; any two may lie nearer,
     * ``axis_spread``: smallest over largest singular value of the rotation axes
       between stations (1: all directions alike, 0: in a plane),
     * ``rank``, ``unknowns``, ``condition`` (at most 1 over the machine's precision):
@@ -187,7 +189,7 @@ def _findings(
     least = cell.plan.min_plane_spread_deg
     if turns < 2:
         found.append(
-            f"{turns} half-turn{'' if turns == 1 else 's'}: at least 2, in planes "
+            f"{counted(turns, 'half-turn')}: at least 2, in planes "
             f"{least:.0f} degrees apart, are needed to calibrate a camera from three "
             "points"
         )

@@ -48,15 +48,15 @@ def plan_motions(
     Every station is within the joint limits, free of collision with clearance, and
     shows all markers' outlines unhidden and with margin to two cameras or more (or to
     the only one), at an allowed tilt; the two stations of a half-turn differ by 180
-    degrees about the flange's z axis, by the same solution of the arm; planes of the
-    half-turns differ by ``plan.min_plane_spread_deg`` or more (Zhao, Liu and Zhang
-    2008, Proposition 1, doi:10.1109/TIP.2008.2005562); ways from station to station
-    are free, straight in joint space or past the points in ``via``. Among what
-    passes, those half-turns are chosen that make the calibration's part of the
-    predicted track error over the workspace box least, but for a hundredth that may
-    be given for a shorter programme, and the order of all stations that takes the
-    least time: the two of a half-turn may be apart, and evaluation stations lie among
-    the others.
+    degrees about the flange's z axis, by the same solution of the arm; the largest
+    angle between the triangle's planes at two half-turns is
+    ``plan.min_plane_spread_deg`` or more (Zhao, Liu and Zhang 2008, Proposition 1,
+    doi:10.1109/TIP.2008.2005562); ways from station to station are free, straight in
+    joint space or past the points in ``via``. Among what passes, those half-turns are
+    chosen that make the calibration's part of the predicted track error over the
+    workspace box least, but for a hundredth that may be given for a shorter
+    programme, and the order of all stations that takes the least time: the two of a
+    half-turn may be apart, and evaluation stations lie among the others.
 
     The certificate holds what :func:`~handeye_tri.plan.certificate.certify` predicts
     from the stations, and

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from handeye_tri.counting import counted
 from handeye_tri.errors import NoPlanError
 
 _REMEDY = {
@@ -72,7 +73,8 @@ def no_plan(
     if solids and most in ("collision", "occlusion", "path"):
         often = f" (most often: {solids.most_common(1)[0][0]})"
     return NoPlanError(
-        f"no plan for cell {cell!r}: {what} among {drawn} candidates; rejected: "
+        f"no plan for cell {cell!r}: {what} among "
+        f"{counted(drawn, 'candidate')}; rejected: "
         f"{listed}. Most in the way is {most}{often}. Do: {_REMEDY[most]}",
         counts,
     )

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from handeye_tri.arm import Arm
 from handeye_tri.config import Cell
+from handeye_tri.counting import counted
 from handeye_tri.errors import InputError
 from handeye_tri.exchange.half_turns import turn_between
 from handeye_tri.plan.candidates import SIGHT_MARGIN
@@ -124,13 +125,14 @@ def _forbidden(arm: Arm, view: View, joints: Floats, seen: Flags) -> list[str]:
             )
         if not inside[k]:
             found.append(
-                f"station {k}: fewer than {view.required} cameras have all markers in "
-                "their image"
+                f"station {k}: all markers are in the images of fewer than "
+                f"{counted(view.required, 'camera')}"
             )
         elif seen[k].sum() < view.required:
             found.append(
-                f"station {k}: fewer than {view.required} cameras see the triangle at "
-                f"less than {view.cell.plan.max_tilt_deg:.0f} degrees"
+                f"station {k}: the triangle is seen by fewer than "
+                f"{counted(view.required, 'camera')} at less than "
+                f"{view.cell.plan.max_tilt_deg:.0f} degrees"
             )
         hit = arm.collision(q)
         if hit is not None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri.counting import counted
 from handeye_tri.errors import InputError
 from handeye_tri.storage.files import read_bytes, write_bytes
 
@@ -66,7 +67,9 @@ def read_joint_list(
         if row
     ]
     if len(values) < 2:
-        raise InputError(f"{path}: holds {len(values)} stations, needs at least 2")
+        raise InputError(
+            f"{path}: holds {counted(len(values), 'station')}, needs at least 2"
+        )
     return np.array(values) * factors
 
 

@@ -70,7 +70,7 @@ def test_two_planes_determine_four_unknowns_and_not_five(axis, sigma) -> None:
     [
         (0, {}, "0 half-turns are too few.*at least 3"),
         (2, {}, r"2 half-turns are too few.*at least 3.*skew=False"),
-        (1, {"skew": False}, "1 half-turns are too few.*at least 2"),
+        (1, {"skew": False}, "1 half-turn is too few.*at least 2"),
         (2, {"skew": False, "distortion": "rational"}, "at least 3 are needed"),
     ],
 )

@@ -124,7 +124,7 @@ def test_conic_basis_holds_the_true_conic(skew, fixed, aspect) -> None:
             InputError,
             "nothing left to estimate",
         ),
-        ({"fixed": {"cx": 519.3}}, DegenerateMotionError, "1 half-turns are too few"),
+        ({"fixed": {"cx": 519.3}}, DegenerateMotionError, "1 half-turn is too few"),
     ],
 )
 def test_bad_choices_are_named(options, error, message) -> None:

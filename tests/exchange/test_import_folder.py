@@ -279,7 +279,7 @@ def test_a_measured_cell_goes_all_the_way_to_the_report(capsys, bench, tmp_path)
         (
             "1,2,3,1,0,0,0",
             ["--pose-format", "quaternion-wxyz:m"],
-            "there are 1 poses and 18 images of left",
+            "1 pose and 18 images of left",
         ),
         (
             "1,2,3,1,0.1,0,0",

@@ -202,7 +202,7 @@ def test_poses_that_hardly_turn_are_refused():
     ("change", "message"),
     [
         (lambda a, b: (a, b[:-1]), "a holds 4 motions and b 3"),
-        (lambda a, b: (a[:1], b[:1]), "holds 1 motions; at least 2"),
+        (lambda a, b: (a[:1], b[:1]), "holds 1 motion; at least 2"),
         (lambda a, b: (a[0], b), r"shape \(n, 4, 4\)"),
         (lambda a, b: (a * [[[np.nan]], [[1]], [[1]], [[1]]], b), r"a\[0\] holds NaN"),
         (

@@ -58,7 +58,7 @@ def test_what_forbids_a_station_is_named():
     assert plan.outcome == "FAIL"
     text = "\n".join(plan.findings)
     assert "station 3: joint t at 6.981 leaves its limits" in text
-    assert "station 6: fewer than 2 cameras have all markers in their image" in text
+    assert "station 6: all markers are in the images of fewer than 2 cameras" in text
 
 
 def test_too_few_stations_say_what_to_add():

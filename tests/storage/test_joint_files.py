@@ -46,7 +46,7 @@ def test_what_is_written_is_read_again(tmp_path):
         (GOOD.replace("250", "much"), "line 2, rail_mm: 'much' is no finite number"),
         (GOOD.replace("250", "nan"), "line 2, rail_mm: 'nan' is no finite number"),
         (GOOD.replace(",-0.5", ""), "line 4, l_rad: '' is no finite number"),
-        ("s_deg,l_deg,rail_m\n1,2,3\n", "holds 1 stations, needs at least 2"),
+        ("s_deg,l_deg,rail_m\n1,2,3\n", "holds 1 station, needs at least 2"),
         (b"\xff\xfe\x00s", "byte 0 is no UTF-8 text"),
     ],
 )
