@@ -140,8 +140,10 @@ def plan(
     else:
         click.echo(plan_text(made, finished.cell.name))
     if finished.is_designed and finished.has_robot:
-        path = write_plan_recording(finished)
+        path, missing = write_plan_recording(finished)
         click.echo(f"wrote {path}: handeye-tri replay {session} --plan", err=True)
+        if missing:
+            click.echo(f"its views are outlines: {missing}", err=True)
     sys.exit(EXIT_CODES[made.outcome])
 
 

@@ -2,54 +2,98 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri.errors import MissingDependencyError
 from handeye_tri.pipeline.run import Run
 from handeye_tri.records import Plan
 from handeye_tri.summary import plan_text
+
+if TYPE_CHECKING:
+    from handeye_tri.config import Cell
 
 Floats = NDArray[np.float64]
 
 PREVIEW = "plan.rrd"
 # Moments of the moving arm are this far apart, and it stands so long at a station.
 _STEP_S, _STAND_S = 0.08, 1.0
+# Views are smaller than the images, by a whole factor, and at most so wide.
+_WIDEST_PX = 512
 
 
-def write_plan_recording(run: Run) -> Path:
+def write_plan_recording(run: Run) -> tuple[Path, str]:
     """Write what a planned session's robot will do and its cameras will see.
+
+    Returns:
+        The file, and why its views are outlines alone; "" where they are rendered.
 
     Raises:
         StorageError: there is no plan, or the file cannot be written.
     """
-    from handeye_tri import replay
+    from handeye_tri import replay, simulate
 
-    plan, arm, cell = run.plan(), run.arm, run.designed_cell
+    plan, arm, cell = run.plan(), run.arm, reduced(run.designed_cell)
     times, joints, station = driven(
         plan, arm.home, arm.speed, cell.arm.acceleration_time_s
     )
-    path = run.folder.file(PREVIEW)
+    motion = replay.PlannedMotion(
+        plan,
+        times,
+        station,
+        arm.body_poses(joints),
+        arm.marker_positions(joints),
+        tuple(camera.camera for camera in cell.cameras),
+        tuple(arm.base_from_world @ c.world_from_camera for c in cell.cameras),
+        np.array(cell.rig.marker_colours),
+    )
+    path, missing = run.folder.file(PREVIEW), ""
+    views: Iterator[replay.View] = iter(())
+    try:
+        simulate.check_rendering()
+    except MissingDependencyError as error:
+        missing = str(error)
+    else:
+        wanted = [
+            (i, k) for k in motion.arrivals().tolist() for i in range(len(cell.cameras))
+        ]
+        views = simulate.render_views(cell, run.model_path, joints, run.seed, wanted)
     replay.write_preview(
         path,
         name=f"{cell.name}, plan",
         mechanism=run.mechanism,
         base_from_world=arm.base_from_world,
-        motion=replay.PlannedMotion(
-            plan,
-            times,
-            station,
-            arm.body_poses(joints),
-            arm.marker_positions(joints),
-            tuple(camera.camera for camera in cell.cameras),
-            tuple(arm.base_from_world @ c.world_from_camera for c in cell.cameras),
-            np.array(cell.rig.marker_colours),
-        ),
+        motion=motion,
         certificate=plan_text(plan, cell.name),
+        views=views,
     )
-    return path
+    return path, missing
+
+
+def reduced(cell: Cell) -> Cell:
+    """The same cell with cameras of fewer, larger pixels, none wider than a limit."""
+    cameras = []
+    for camera in cell.cameras:
+        factor = -(-camera.image_size_px[0] // _WIDEST_PX)
+        width, height = (size // factor for size in camera.image_size_px)
+        focal, centre = np.array(camera.focal_px), np.array(camera.principal_point_px)
+        update = {
+            "image_size_px": (width, height),
+            "focal_px": tuple((focal / factor).tolist()),
+            # The first pixel's centre is (0, 0), its corner half a pixel before.
+            "principal_point_px": tuple(((centre + 0.5) / factor - 0.5).tolist()),
+            "skew_px": camera.skew_px / factor,
+        }
+        cameras.append(camera.model_copy(update=update))
+    # Nothing is measured in them.
+    plain = {"supersample": 1, "blur_px": 0.0, "noise_percent": 0.0}
+    imaging = cell.imaging.model_copy(update=plain)
+    return cell.model_copy(update={"cameras": tuple(cameras), "imaging": imaging})
 
 
 def driven(

@@ -1,7 +1,7 @@
 """A session and its result as a recording to look at; the only user of rerun."""
 
 from handeye_tri.replay.layout import BLUEPRINTS
-from handeye_tri.replay.preview import PlannedMotion, write_preview
+from handeye_tri.replay.preview import PlannedMotion, View, write_preview
 from handeye_tri.replay.reconstruction import Thing, write_reconstruction
 from handeye_tri.replay.recording import write_recording
 from handeye_tri.replay.steps import SolverStep
@@ -10,6 +10,7 @@ from handeye_tri.replay.viewer import open_viewer, screenshot, serve
 __all__ = [
     "BLUEPRINTS",
     "PlannedMotion",
+    "View",
     "SolverStep",
     "Thing",
     "open_viewer",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,8 +32,11 @@ from handeye_tri.se3 import SE3
 
 Floats = NDArray[np.float64]
 
-# A marker's disc in an image, pixels of the image.
-_DISC_PX = 9.0
+# A marker's disc where no image shows it, pixels of the image.
+_DISC_PX = 4.5
+_JPEG_QUALITY = 80
+# Camera, moment, and what is seen: RGB, shape (h, w, 3), or grey, (h, w).
+View = tuple[int, int, NDArray[np.uint8]]
 _CLOSED = [0, 1, 2, 0]
 
 
@@ -94,6 +98,7 @@ def write_preview(
     base_from_world: SE3,
     motion: PlannedMotion,
     certificate: str,
+    views: Iterable[View] = (),
 ) -> None:
     """Write a plan's recording, whole or not at all.
 
@@ -106,11 +111,16 @@ def write_preview(
         base_from_world: Where the world is, seen from the robot's base.
         motion: What the arm does.
         certificate: What the plan promises, plain text.
+        views: What the cameras see, by moment, and by camera at each; the last is
+            shown while the robot stands, and outlines alone where there is none.
 
     Raises:
         StorageError: the file cannot be written.
     """
     images, arrivals = motion.images(), motion.arrivals()
+    rendered = iter(views)
+    view = next(rendered, None)
+    pictured = [False] * len(motion.cameras)
     with recorded(path, name, _layout(motion, base_from_world)) as recording:
         log_cell(recording, mechanism, base_from_world)
         _log_still(recording, motion, images, arrivals, certificate)
@@ -123,8 +133,23 @@ def write_preview(
                 recording.log("log", rr.TextLog(_words(motion.plan, j), level="INFO"))
             for body, pose in enumerate(motion.world_from_body[k][1:], 1):
                 recording.log(body_path(mechanism, body), transform(pose))
-            for camera, pixels in zip(motion.cameras, images[:, k], strict=True):
-                _log_view(recording, motion, camera.name, pixels, j)
+            seen = dict[int, NDArray[np.uint8]]()
+            while view is not None and view[1] == k:
+                seen[view[0]] = view[2]
+                view = next(rendered, None)
+            for i, camera in enumerate(motion.cameras):
+                image = f"{camera_path(camera.name)}/image"
+                if i in seen:
+                    picture = rr.Image(seen[i]).compress(jpeg_quality=_JPEG_QUALITY)
+                    recording.log(image, picture)
+                    pictured[i] = True
+                elif pictured[i] and j < 0:
+                    # What was seen at the last station is not what is seen now.
+                    recording.log(image, rr.Clear(recursive=False))
+                    pictured[i] = False
+                _log_outline(
+                    recording, motion, camera.name, images[i, k], j, not pictured[i]
+                )
 
 
 def _colour(plan: Plan, station: int) -> Colour:
@@ -201,14 +226,24 @@ def _log_still(
     recording.log(NUMBERS, rr.TextDocument(json.dumps(numbers)), static=True)
 
 
-def _log_view(
+def _log_outline(
     recording: rr.RecordingStream,
     motion: PlannedMotion,
     camera: str,
     pixels: Floats,
     station: int,
+    discs: bool,
 ) -> None:
-    """The triangle (3, 2) in an image; ringed where the robot stands."""
+    """The triangle (3, 2) in an image; ringed where the robot stands.
+
+    Args:
+        recording: Where to.
+        motion: What the arm does.
+        camera: Whose image.
+        pixels: A, B, C, shape (3, 2); NaN outside.
+        station: Where the robot stands, -1 on the way.
+        discs: Whether to draw discs for the markers: no image shows them.
+    """
     path = camera_path(camera)
     whole = bool(np.isfinite(pixels).all())
     colour = _colour(motion.plan, station)
@@ -222,11 +257,12 @@ def _log_view(
         ),
     )
     seen = np.isfinite(pixels).all(axis=1)
-    colours = np.round(255 * motion.marker_colours[seen]).astype(np.uint8)
+    drawn = seen & discs
+    colours = np.round(255 * motion.marker_colours[drawn]).astype(np.uint8)
     recording.log(
         f"{path}/markers",
         rr.Points2D(
-            pixels[seen] + CORNER, colors=colours, radii=[_DISC_PX], draw_order=21
+            pixels[drawn] + CORNER, colors=colours, radii=[_DISC_PX], draw_order=21
         ),
     )
     ringed = pixels[seen] + CORNER if station >= 0 else np.zeros((0, 2))
@@ -249,7 +285,7 @@ def _layout(motion: PlannedMotion, base_from_world: SE3) -> rrb.Blueprint:
     views = [
         rrb.Spatial2DView(
             origin=camera_path(camera.name),
-            name=f"{camera.name}: the triangle as it will be seen; dots: all stations",
+            name=f"{camera.name}: what it will see; dots: all stations",
         )
         for camera in motion.cameras
     ]

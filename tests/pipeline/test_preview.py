@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from handeye_tri import storage
+from handeye_tri import simulate, storage
 from handeye_tri.cli import main
-from handeye_tri.errors import InputError
+from handeye_tri.errors import InputError, MissingDependencyError
 from handeye_tri.pipeline import NullProgress, Run
-from handeye_tri.pipeline.preview import driven
+from handeye_tri.pipeline.preview import driven, reduced
 from handeye_tri.plan.sequence import travel_time
 from handeye_tri.replay import PlannedMotion, screenshot
 from handeye_tri.replay.engine import RrdReader
@@ -93,6 +93,56 @@ def test_it_is_drawn_without_a_view_error(run, tmp_path):
     other = tmp_path / "other.png"
     with pytest.raises(InputError, match="station 99 is not in"):
         screenshot(run.folder.file("plan.rrd"), other, station=99)
+
+
+def entities(path):
+    chunks = RrdReader(path).stream().to_chunks()
+    return {str(chunk.entity_path) for chunk in chunks}
+
+
+def test_views_are_rendered_once_a_station_and_small(run):
+    path = run.folder.file("plan.rrd")
+    images = [
+        chunk
+        for chunk in RrdReader(path).stream().to_chunks()
+        if str(chunk.entity_path).endswith("left/image")
+        and any("Image" in str(name) for name in chunk.to_record_batch().schema.names)
+    ]
+    assert sum(chunk.num_rows for chunk in images) >= len(run.plan().stations)
+    assert path.stat().st_size < 2**21
+
+
+def test_a_smaller_camera_sees_the_same(run):
+    cell = run.designed_cell
+    small = reduced(cell)
+    rng = np.random.default_rng(0)
+    for one, other in zip(cell.cameras, small.cameras, strict=True):
+        assert other.image_size_px == (512, 384)
+        points = np.append(rng.uniform(-0.2, 0.2, (20, 2)), np.ones((20, 1)), axis=1)
+        np.testing.assert_allclose(
+            other.camera.project(points),
+            (one.camera.project(points) + 0.5) / 2 - 0.5,
+            atol=1e-9,
+        )
+
+
+def test_without_opengl_views_are_outlines_and_the_user_is_told(
+    run, monkeypatch, tmp_path, capsys
+):
+    def refuse():
+        raise MissingDependencyError("no OpenGL here; install it")
+
+    monkeypatch.setattr(simulate, "check_rendering", refuse)
+    rendered = entities(run.folder.file("plan.rrd"))
+    run.folder.file("plan.rrd").rename(tmp_path / "plan.rrd")
+    with pytest.raises(SystemExit):
+        main(["plan", str(run.folder.path)])
+    outlined = entities(run.folder.file("plan.rrd"))
+    (tmp_path / "plan.rrd").rename(run.folder.file("plan.rrd"))
+    assert "its views are outlines: no OpenGL here" in capsys.readouterr().err
+    gone = {name for name in rendered - outlined}
+    assert {name.rsplit("/", 2)[-2] for name in gone} == {"left", "right"}
+    assert {name.rsplit("/", 1)[-1] for name in gone} == {"image"}
 
 
 def test_timelines_are_time_and_station(run):
