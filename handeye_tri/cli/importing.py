@@ -170,6 +170,7 @@ def import_(
             progress,
             cell_file=found.cell_file,
             model_file=found.model_file,
+            others=found.others,
         )
     finally:
         progress.close()

@@ -25,7 +25,7 @@ _LEAST_POSES = 6
 _FEWEST = 3
 _MOST_DROPPED = 0.3
 # Robots that calibrate move by this much, metres; else the unit is doubtful.
-_PLAUSIBLE = (0.005, 10.0)
+PLAUSIBLE_SPREAD = (0.005, 10.0)
 # Another reading must fit this many times worse to be ruled out.
 _CLEARLY = 2.0
 # Robot and camera may disagree on the metre by this much before it is a wrong input.
@@ -197,7 +197,7 @@ def _size_gate(pairs: PosePairs, solution: PoseSolution) -> Gate:
         for poses in (solution.base_from_flange, solution.b)
     ]
     extent = max(extents if pairs.metric else extents[:1])
-    least, most = _PLAUSIBLE
+    least, most = PLAUSIBLE_SPREAD
     use = max(least / max(extent, 1e-12), extent / most)
     return Gate(
         "poses spread over",

@@ -76,7 +76,7 @@ def paired_stations(table: PoseTable, images: Mapping[str, list[Path]]) -> Captu
     A name is a file's name with or without its suffix, or the last number in it.
 
     Raises:
-        InputError: counts differ, or a named pose has no image.
+        InputError: counts differ, a named pose has no image, or two have the same.
     """
     poses = table.base_from_flange
     if table.names:
@@ -105,12 +105,20 @@ def paired_stations(table: PoseTable, images: Mapping[str, list[Path]]) -> Captu
 def _by_name(table: PoseTable, images: Mapping[str, list[Path]]) -> Capture:
     shots, remarks = [], []
     lookups = {camera: _lookup(camera, paths) for camera, paths in images.items()}
+    poses: dict[Path, str] = {}
     for name, pose in zip(table.names, table.base_from_flange, strict=True):
         found: dict[str, Picture] = {}
         for camera, lookup in lookups.items():
             path = lookup.get(name) or lookup.get(_number(name))
-            if path is not None:
-                found[camera] = _reader(path)
+            if path is None:
+                continue
+            if path in poses:
+                raise InputError(
+                    f"the poses {poses[path]!r} and {name!r} have one image, "
+                    f"{camera}/{path.name}; name each image once"
+                )
+            poses[path] = name
+            found[camera] = _reader(path)
         if not found:
             some = ", ".join(path.name for paths in images.values() for path in paths)
             raise InputError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 from handeye_tri import storage
 from handeye_tri.config import Cell, CellToCalibrate
 from handeye_tri.counting import counted
+from handeye_tri.diagnose.pose_pairs import PLAUSIBLE_SPREAD
 from handeye_tri.errors import InputError
 from handeye_tri.exchange.capture import Capture
 from handeye_tri.exchange.half_turns import (
@@ -73,6 +74,7 @@ def import_session(
     *,
     cell_file: str,
     model_file: str,
+    others: Callable[[], Iterable[tuple[str, Floats]]] = tuple,
 ) -> list[str]:
     """Write a session; poses and half-turns are checked before the first file.
 
@@ -85,16 +87,20 @@ def import_session(
         progress: Told of every image.
         cell_file: Path of the cell's description, or what held it.
         model_file: Path of the robot's model; "" where there is none.
+        others: What else the poses' numbers could mean, see
+            :class:`handeye_tri.pipeline.sources.Found`.
 
     Returns:
         What was found, in lines for the user.
 
     Raises:
-        InputError: too few half-turns, or an image of the wrong size.
+        InputError: too few half-turns, poses that no robot makes, or an image of the
+            wrong size.
         StorageError: the folder holds something else, or an image is damaged.
     """
     base_from_flange = np.array([s.base_from_flange.matrix for s in capture.shots])
-    turns, lines = _half_turns(base_from_flange, cell, corrections)
+    turns, lines = _half_turns(base_from_flange, cell, corrections, others)
+    _check_spread(base_from_flange)
     held_out = _held_out(turns, len(base_from_flange), corrections.held_out)
     plan = _plan(capture, turns, held_out, cell)
     folder = _folder(out, cell, source, cell_file, model_file, len(turns))
@@ -119,8 +125,44 @@ def import_session(
     ]
 
 
+def _check_spread(base_from_flange: Floats) -> None:
+    """Raise InputError where no robot can have made the poses."""
+    spread = float(np.linalg.norm(np.ptp(base_from_flange[:, :3, 3], axis=0)))
+    least, most = PLAUSIBLE_SPREAD
+    if not least <= spread <= most:
+        raise InputError(
+            f"the flange's positions spread over {spread:.4g} m, where robots that "
+            f"calibrate move by {least:g} to {most:g} m: is the unit of length, m or "
+            "mm, the one that the robot's numbers are in?"
+        )
+
+
+def _other_reading(
+    others: Callable[[], Iterable[tuple[str, Floats]]], tolerance: TurnTolerance
+) -> str:
+    """By which other reading there would be half-turns, or what else to do."""
+    least, most = PLAUSIBLE_SPREAD
+    best, words = _LEAST_TURNS - 1, ""
+    for options, poses in others():
+        spread = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
+        if not least <= spread <= most:
+            continue
+        count = len(find_half_turns(poses, tolerance).turns)
+        if count > best:
+            best, words = count, options
+    if words:
+        return f"read by {words} there would be {best}: is that what the numbers mean?"
+    return (
+        "name them with --half-turns, widen --turn-tolerance, or see whether the poses "
+        "are in the format, unit and direction that were stated"
+    )
+
+
 def _half_turns(
-    base_from_flange: Floats, cell: CellToCalibrate, corrections: Corrections
+    base_from_flange: Floats,
+    cell: CellToCalibrate,
+    corrections: Corrections,
+    others: Callable[[], Iterable[tuple[str, Floats]]],
 ) -> tuple[tuple[Turn, ...], list[str]]:
     """The half-turns, and what to tell of them."""
     named = corrections.half_turns is not None
@@ -146,7 +188,7 @@ def _half_turns(
             f"{counted(len(base_from_flange), 'station')}, at least "
             f"{_LEAST_TURNS} are needed; "
             + ("; ".join(found.others[:3]) + "; " if found.others else "")
-            + "name them with --half-turns, or widen --turn-tolerance"
+            + _other_reading(others, corrections.tolerance)
         )
     if not named:
         axis = " ".join(f"{value:+.3f}" for value in found.axis)

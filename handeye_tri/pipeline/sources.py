@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ from handeye_tri.exchange.image_folders import (
     paired_stations,
     timed_images,
 )
+from handeye_tri.exchange.other_readings import other_readings
 from handeye_tri.exchange.pose_tables import (
     PoseFormat,
     PoseTable,
@@ -27,7 +29,7 @@ from handeye_tri.exchange.pose_tables import (
     read_pose_table,
 )
 from handeye_tri.exchange.standstill import stations_from_streams
-from handeye_tri.records import RobotDirection
+from handeye_tri.records import Floats, RobotDirection
 
 if TYPE_CHECKING:
     from handeye_tri.exchange.bags import BagFile, Forward
@@ -89,6 +91,8 @@ class Found:
         cell_file: Where its description was.
         model_file: The robot's model; "" where there is none.
         proposals: Options that were taken as proposed, as a user would type them.
+        others: What else the poses' numbers could mean: the options that say so, and
+            the poses so read, (n, 4, 4), metres.
     """
 
     capture: Capture
@@ -96,6 +100,7 @@ class Found:
     cell_file: str
     model_file: str
     proposals: tuple[str, ...] = ()
+    others: Callable[[], Iterable[tuple[str, Floats]]] = tuple
 
 
 def read_source(layout: str, source: Path, named: Named) -> Found:
@@ -119,7 +124,11 @@ def read_source(layout: str, source: Path, named: Named) -> Found:
         if layout == "euroc"
         else _from_images(layout, source, named, cell)
     )
-    return Found(capture, cell, cell_file, model_file)
+    found = Found(capture, cell, cell_file, model_file)
+    if named.pose_format is None or named.image_times is not None:
+        return found
+    stated = PoseFormat.parse(named.pose_format)
+    return replace(found, others=partial(other_readings, named.poses, stated))
 
 
 def _cell(name: str) -> tuple[CellToCalibrate, str, str]:

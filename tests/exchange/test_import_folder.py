@@ -361,3 +361,64 @@ def test_images_of_another_size_or_none_are_refused(capsys, bench, tmp_path):
         assert code == 2
         assert message in err
         assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("written", "stated", "direction"),
+    [
+        ("quaternion-wxyz:m", "quaternion-xyzw:m", "flange_in_base"),
+        ("rotation-vector:mm,rad", "rotation-vector:mm,deg", "flange_in_base"),
+        ("rotation-vector:m,deg", "euler-zyx-moving:m,deg", "flange_in_base"),
+        ("axis-angle:mm,deg", "axis-angle:mm,deg", "base_in_flange"),
+    ],
+)
+def test_numbers_read_wrongly_are_told_what_they_could_mean(
+    capsys, bench, tmp_path, written, stated, direction
+):
+    path = tmp_path / "poses.csv"
+    path.write_text(table(COLUMNS[written](pose) for pose in bench[2]))
+    out = tmp_path / "out"
+    options = ("--poses", path, "--pose-format", stated, "--direction", direction)
+    code, _, err = imported(capsys, bench, out, *options)
+    assert code == 2
+    assert (
+        f"read by --pose-format {written} --direction flange_in_base there would be "
+        "6: is that what the numbers mean?" in err
+    )
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("written", "stated"),
+    [
+        ("quaternion-wxyz:m", "quaternion-wxyz:mm"),
+        ("quaternion-xyzw:mm", "quaternion-xyzw:m"),
+    ],
+)
+def test_lengths_that_no_robot_has_are_no_unit(
+    capsys, bench, tmp_path, written, stated
+):
+    path = tmp_path / "poses.csv"
+    # A robot that misses its half-turns by nothing has them in every unit.
+    path.write_text(table(COLUMNS[written](pose) for pose in bench[2]))
+    options = ("--poses", path, "--pose-format", stated)
+    code, _, err = imported(
+        capsys, bench, tmp_path / "out", *options, "--direction", "flange_in_base"
+    )
+    assert code == 2
+    assert "robots that calibrate move by 0.005 to 10 m: is the unit" in err
+
+
+def test_an_image_that_two_poses_name_is_refused(capsys, bench, tmp_path):
+    rows = [COLUMNS["matrix:m"](pose) for pose in bench[2]]
+    names = [f"shot{max(j, 1)}.png" for j in range(len(rows))]
+    lines = [
+        ",".join([name, *map(repr, map(float, row))])
+        for name, row in zip(names, rows, strict=True)
+    ]
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join(["image", *lines]))
+    options = ("--pose-format", "matrix:m", "--direction", "flange_in_base")
+    code, _, err = imported(capsys, bench, tmp_path / "out", "--poses", path, *options)
+    assert code == 2
+    assert "'shot1.png' and 'shot1.png' have one image, left/shot1.png" in err
