@@ -17,7 +17,7 @@ PACKAGE = REPO / "handeye_tri"
 # A module imports only from rows before its own. A folder is one module.
 ROWS: tuple[tuple[str, ...], ...] = (
     ("errors", "threads", "counting"),
-    ("se3",),
+    ("se3", "arguments"),
     ("camera", "triangle"),
     ("records",),
     # Both hand out, or hold their arrays as, records.

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri import arguments
 from handeye_tri.adjustment.model import AdjustmentModel, Linearisation
 from handeye_tri.adjustment.problem import Sides, State, Stations
 from handeye_tri.adjustment.result import adjustment_result, check_determined
@@ -95,7 +96,7 @@ def adjust(
         DegenerateMotionError: the data do not determine the unknowns; names them.
         ConvergenceError: the iteration did not settle.
     """
-    _check(session, start, side_sigma, robot_parameters, on_axis_correlation)
+    _check(session, start, side_sigma, loss, robot_parameters, on_axis_correlation)
     # Products of a few hundred numbers a side: threads cost more than they bring.
     with one_thread():
         return _adjusted(
@@ -146,9 +147,12 @@ def _check(
     session: Session,
     start: HandEyeCalibration,
     side_sigma: float,
+    loss: Loss | None,
     robot_parameters: RobotParameters | None,
     on_axis_correlation: float | None,
 ) -> None:
+    arguments.record("session", session, Session)
+    arguments.record("start", start, HandEyeCalibration)
     names = tuple(camera.name for camera in start.cameras)
     expected = tuple(info.name for info in session.cameras)
     if names != expected:
@@ -156,17 +160,22 @@ def _check(
             f"start has the cameras ({', '.join(names)}), the session "
             f"({', '.join(expected)}); give them in the session's order"
         )
-    if not side_sigma >= 0:
+    if loss is not None:
+        arguments.record("loss", loss, Loss)
+    if not arguments.number("side_sigma", side_sigma) >= 0:
         raise InputError(
             f"side_sigma must be 0 or more (metres, or infinite), got {side_sigma}"
         )
-    if on_axis_correlation is not None and not 0 <= on_axis_correlation < 1:
+    if on_axis_correlation is not None and not (
+        0 <= arguments.number("on_axis_correlation", on_axis_correlation) < 1
+    ):
         raise InputError(
             "on_axis_correlation must be at least 0 and below 1, "
             f"got {on_axis_correlation}"
         )
     if robot_parameters is None:
         return
+    arguments.record("robot_parameters", robot_parameters, RobotParameters)
     n = len(session.stations)
     if len(robot_parameters.jacobian) != n:
         raise InputError(

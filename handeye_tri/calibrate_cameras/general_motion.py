@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import fdtri
 
+from handeye_tri import arguments
 from handeye_tri.calibrate_cameras.assemble import (
     MetricCamera,
     in_first_frame,
@@ -105,6 +106,7 @@ def calibrate_cameras_general(
             their epipolar geometry says that they can be explained.
     """
     check_triangle(triangle)
+    arguments.flag("skew", skew)
     lens_model, lens = lens_choice(distortion)
     wanted = [LENS_COEFFICIENTS[lens_model][index] for index in lens]
     observed = read_points(points)

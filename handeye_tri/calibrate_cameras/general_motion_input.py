@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handeye_tri import arguments
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.records import numeric
 from handeye_tri.triangle import VERTICES
@@ -67,18 +68,11 @@ def read_cameras(
     Raises:
         InputError: there are not m, names repeat, or a point is outside its image.
     """
-    labels = [f"camera{i}" for i in range(m)] if names is None else list(names)
-    if len(labels) != m or len(set(labels)) < m:
-        raise InputError(f"names must be {m} different ones, got {labels}")
-    size = np.asarray(image_sizes)
-    if size.shape == (2,):
-        size = np.tile(size, (m, 1))
-    if size.shape != (m, 2) or not (size >= 1).all():
-        raise InputError(
-            f"image_sizes must be (width, height) in pixels, one or {m} of them; got "
-            f"{np.asarray(image_sizes).tolist()}"
-        )
-    limit = size[:, None, None] - 0.5
+    labels = [f"camera{i}" for i in range(m)]
+    if names is not None:
+        labels = arguments.titles("names", names, m)
+    size = arguments.image_sizes("image_sizes", image_sizes, m)
+    limit = np.array(size)[:, None, None] - 0.5
     outside = np.argwhere(((observed < -0.5) | (observed > limit)).any(axis=-1))
     if len(outside):
         i, j, k = outside[0]
@@ -89,7 +83,7 @@ def read_cameras(
             f"({len(outside)} such points); check image_sizes and the order (column, "
             "row)"
         )
-    return labels, [(int(width), int(height)) for width, height in size]
+    return labels, size
 
 
 def check_enough(labels: Sequence[str], observed: Floats) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handeye_tri import arguments
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.records import numeric
 from handeye_tri.triangle import AXES, VERTICES, Axis, TriangleRig
@@ -139,10 +140,8 @@ def read_half_turns(
             "after it (the others hold NaN); check the detection"
         )
     kept = tuple(axes[i] for i in used)
-    size = np.asarray(image_size)
-    if size.shape != (2,) or not (size >= 1).all():
-        raise InputError(f"image_size must be (width, height) in pixels, got {size}")
-    for i, error in _faults(pixels[used], kept, size, used):
+    size = arguments.image_size("image_size", image_size)
+    for i, error in _faults(pixels[used], kept, np.array(size), used):
         if dropped is None:
             raise error
         dropped.setdefault(int(i), str(error))
@@ -162,7 +161,7 @@ def read_half_turns(
         np.array([motions[name].rotation for name in kept]).reshape(-1, 3, 3),
         np.array([motions[name].translation for name in kept]).reshape(-1, 3),
         np.array([float(name == "normal") for name in kept]),
-        (int(image_size[0]), int(image_size[1])),
+        size,
         used,
     )
     return data, used
@@ -195,7 +194,7 @@ def read_axes(axis: Axis | Sequence[Axis], n: int) -> tuple[Axis, ...]:
     if not isinstance(axis, Sequence):
         raise InputError(
             f"axis must be one of {', '.join(AXES)}, or a sequence of them, one per "
-            f"half-turn; got {axis!r}"
+            f"half-turn; got {arguments.shown(axis)}"
         )
     axes: tuple[Any, ...] = (axis,) * n if isinstance(axis, str) else tuple(axis)
     if len(axes) != n:
@@ -214,12 +213,7 @@ def read_sigma(sigma_px: float | None) -> float:
     Raises:
         InputError: it is no positive number.
     """
-    if sigma_px is None:
-        return 1.0
-    value = numeric("sigma_px", sigma_px)
-    if value.shape != () or not (np.isfinite(value) and value > 0):
-        raise InputError(f"sigma_px must be a positive number, got {sigma_px}")
-    return float(value)
+    return 1.0 if sigma_px is None else arguments.positive("sigma_px", sigma_px)
 
 
 def _whitener(sigma_px: float | None, covariance: ArrayLike | None, n: int) -> Floats:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri import arguments
 from handeye_tri.calibrate_cameras.homography import ImageScale
 from handeye_tri.camera import INTRINSIC_NAMES, LENS_COEFFICIENTS, LensModel
 from handeye_tri.errors import InputError
-from handeye_tri.records import numeric
 
 Floats = NDArray[np.float64]
 
@@ -58,9 +58,7 @@ class IntrinsicChoice:
         if not (np.nan_to_num(known[:2], nan=1.0) > 0).all():
             raise InputError(f"fixed focal lengths must be positive, got {fixed}")
         if aspect is not None:
-            ratio = numeric("aspect", aspect)
-            if ratio.shape or not (np.isfinite(ratio) and ratio > 0):
-                raise InputError(f"aspect must be a positive fy / fx, got {aspect}")
+            aspect = arguments.positive("aspect (fy / fx)", aspect)
             if np.isfinite(known[:2]).all():
                 raise InputError(
                     "aspect, fixed fx and fixed fy are one too many; leave one out"
@@ -145,7 +143,7 @@ def split_fixed(
             raise InputError(
                 f"fixed[{name!r}] is none of {', '.join((*INTRINSIC_NAMES, *names))}"
             )
-        if numeric(f"fixed[{name!r}]", value).shape or not np.isfinite(value):
+        if not np.isfinite(arguments.number(f"fixed[{name!r}]", value)):
             raise InputError(f"fixed[{name!r}] must be a finite number, got {value}")
         if name in INTRINSIC_NAMES:
             inner[name] = float(value)

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handeye_tri import arguments
 from handeye_tri.calibrate_cameras.homography import OMode
 from handeye_tri.camera import LENS_COEFFICIENTS, LensModel
 from handeye_tri.errors import InputError
@@ -40,10 +41,14 @@ def lens_choice(
     elif not isinstance(distortion, Sequence):
         raise InputError(
             "distortion must be None, a lens model or a sequence of coefficients' "
-            f"names, got {distortion!r}"
+            f"names, got {arguments.shown(distortion)}"
         )
     else:
         wanted = tuple(distortion)
+        if not all(isinstance(name, str) for name in wanted):
+            raise InputError(
+                f"distortion must name coefficients, got {arguments.shown(distortion)}"
+            )
     model: LensModel = (
         "radtan" if set(wanted) <= set(LENS_COEFFICIENTS["radtan"]) else "rational"
     )

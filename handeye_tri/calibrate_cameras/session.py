@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri import arguments
 from handeye_tri.calibrate_cameras.bundle import TurnNoise, bundle_cameras
 from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
 from handeye_tri.calibrate_cameras.session_camera import (
@@ -76,6 +77,7 @@ def calibrate_session_cameras(session: Session) -> CameraCalibration:
             names the camera, how many it saw, how many it needs.
         ConvergenceError: an iteration did not settle.
     """
+    arguments.record("session", session, Session)
     m, n = len(session.cameras), len(session.stations)
     if not session.half_turns:
         raise DegenerateMotionError(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handeye_tri import arguments
 from handeye_tri.calibrate_cameras.closed_form import (
     ClosedForm,
     ClosedFormMethod,
@@ -164,9 +165,11 @@ def calibrate_camera(
         DegenerateMotionError: the half-turns do not determine the camera.
         ConvergenceError: the refinement did not settle.
     """
+    for what, value in (("skew", skew), ("refine", refine), ("reject", reject)):
+        arguments.flag(what, value)
+    arguments.title("name", name)
+    arguments.check_one_of("method", method, get_args(ClosedFormMethod))
     lens_model, lens = lens_choice(distortion)
-    if method not in ("whitened", "paper"):
-        raise InputError(f'method must be "whitened" or "paper", got {method!r}')
     inner, coefficients = split_fixed(fixed, lens_model, lens)
     choice = IntrinsicChoice.of(skew, inner, aspect)
     partly = fixed is not None or aspect is not None
@@ -190,11 +193,13 @@ def calibrate_camera(
     )
     n = len(np.asarray(before))
     noise_known = sigma_px is not None or covariance is not None
-    if loss is not None and (loss not in LOSSES or not noise_known or not refine):
-        raise InputError(
-            f"loss must be None or one of {', '.join(LOSSES)}, with refine=True and "
-            f"sigma_px or covariance, which say what is far; got {loss!r}"
-        )
+    if loss is not None:
+        arguments.check_one_of("loss", loss, LOSSES)
+        if not noise_known or not refine:
+            raise InputError(
+                f'loss="{loss}" needs refine=True, and sigma_px or covariance, which '
+                "say what is far"
+            )
     turn = turn_covariances(turn_covariance, n, used, noise_known)
 
     def build(part: HalfTurnData, rows: NDArray[np.intp]) -> HalfTurnModel:

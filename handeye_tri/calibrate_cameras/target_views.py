@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handeye_tri import arguments
 from handeye_tri.calibrate_cameras.bundle_input import check_links
 from handeye_tri.calibrate_cameras.degeneracy import (
     MAX_CONDITION,
@@ -34,7 +35,7 @@ from handeye_tri.camera import (
     PinholeCamera,
 )
 from handeye_tri.errors import ConvergenceError, DegenerateMotionError, InputError
-from handeye_tri.records import CameraCalibration, Covariance, motion_labels
+from handeye_tri.records import CameraCalibration, Covariance, motion_labels, numeric
 from handeye_tri.se3 import SE3, hat
 from handeye_tri.threads import one_thread
 
@@ -91,12 +92,13 @@ def calibrate_target_views(
     target = _target(points)
     observed = _observed(pixels, target.shape[1])
     m, n, p, _ = observed.shape
-    labels = [f"camera{i}" for i in range(m)] if names is None else list(names)
-    if len(labels) != m or len(set(labels)) < m:
-        raise InputError(f"names must be {m} different ones, got {labels}")
+    labels = [f"camera{i}" for i in range(m)]
+    if names is not None:
+        labels = arguments.titles("names", names, m)
     sizes = _sizes(image_sizes, observed, labels)
-    if sigma_px is not None and not (np.isfinite(sigma_px) and sigma_px > 0):
-        raise InputError(f"sigma_px must be a positive number, got {sigma_px}")
+    arguments.flag("skew", skew)
+    if sigma_px is not None:
+        arguments.positive("sigma_px", sigma_px)
     lens_model, lens = lens_choice(distortion)
     seen = np.isfinite(observed).all(axis=-1)
     seen &= seen.sum(axis=2, keepdims=True) >= _LEAST_POINTS
@@ -174,7 +176,7 @@ def calibrate_target_views(
 
 def _target(points: ArrayLike) -> Floats:
     """The target in its plane, shape (2, p)."""
-    target = np.asarray(points, dtype=float)
+    target = numeric("points", points)
     if target.ndim != 2 or target.shape[1] != 3 or len(target) < _LEAST_POINTS:
         raise InputError(
             f"points must have shape (p, 3), p >= {_LEAST_POINTS}, got {target.shape}"
@@ -188,7 +190,7 @@ def _target(points: ArrayLike) -> Floats:
 
 
 def _observed(pixels: ArrayLike, p: int) -> Floats:
-    observed = np.asarray(pixels, dtype=float)
+    observed = numeric("pixels", pixels)
     if observed.ndim != 4 or observed.shape[2:] != (p, 2) or not observed.size:
         raise InputError(
             f"pixels must have shape (m, n, {p}, 2): camera, view, point, (column, "
@@ -202,16 +204,8 @@ def _sizes(
     observed: Floats,
     labels: Sequence[str],
 ) -> list[tuple[int, int]]:
-    m = len(labels)
-    size = np.asarray(image_sizes)
-    if size.shape == (2,):
-        size = np.tile(size, (m, 1))
-    if size.shape != (m, 2) or not (size >= 1).all():
-        raise InputError(
-            f"image_sizes must be (width, height) in pixels, one or {m} of them; got "
-            f"{np.asarray(image_sizes).tolist()}"
-        )
-    outside = (observed < -0.5) | (observed > size[:, None, None] - 0.5)
+    size = arguments.image_sizes("image_sizes", image_sizes, len(labels))
+    outside = (observed < -0.5) | (observed > np.array(size)[:, None, None] - 0.5)
     if outside.any():
         i, j, k, _ = np.argwhere(outside)[0]
         u, v = observed[i, j, k]
@@ -220,7 +214,7 @@ def _sizes(
             f"outside the {size[i][0]} x {size[i][1]} image; check image_sizes and the "
             "order (column, row)"
         )
-    return [(int(width), int(height)) for width, height in size]
+    return size
 
 
 def _covariance(

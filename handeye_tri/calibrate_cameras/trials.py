@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
+from handeye_tri import arguments
 from handeye_tri.calibrate_cameras.degeneracy import (
     MAX_CONDITION,
     MAX_RELATIVE_SIGMA,
@@ -137,11 +138,10 @@ def calibrate_trials(
     pixels, complete = _read(before, after)
     t, n = pixels.shape[:2]
     axes = read_axes(axis, n)
-    size = np.asarray(image_size)
-    if size.shape != (2,) or not (size >= 1).all():
-        raise InputError(f"image_size must be (width, height) in pixels, got {size}")
-    if sigma_px is not None and not (np.isfinite(sigma_px) and sigma_px > 0):
-        raise InputError(f"sigma_px must be a positive number, got {sigma_px}")
+    size = arguments.image_size("image_size", image_size)
+    arguments.flag("skew", skew)
+    if sigma_px is not None:
+        arguments.positive("sigma_px", sigma_px)
     lens_model, lens = lens_choice(distortion)
     o_mode, known_o = o_choice(o)
     about = np.array([name == "normal" for name in axes])
@@ -159,7 +159,7 @@ def calibrate_trials(
     check_count(n, inner, shared, per_half_turn)
     check_axis_ends(triangle, axes)
     failures = np.full(t, "", dtype=object)
-    inside = (pixels > -0.5) & (pixels < size - 0.5)
+    inside = (pixels > -0.5) & (pixels < np.array(size) - 0.5)
     inside |= ~complete[..., None, None]
     failures[~inside.all(axis=(1, 2, 3))] = "a marker lies outside the image"
     needed = max((inner + 1) // 2, shared // per_half_turn + 1)
@@ -195,7 +195,7 @@ def calibrate_trials(
             pixels=np.ascontiguousarray(pixels[rows].transpose(3, 2, 1, 0)),
             weight=np.ascontiguousarray(complete[rows].T.astype(float)),
         )
-        found = _solve(part, dof[rows], known_o, image_size, sigma_px)
+        found = _solve(part, dof[rows], known_o, size, sigma_px)
         _fill(result, rows, part, found, about, failures, sigma_px)
     for name in TrialCalibrations.__slots__:
         value = getattr(result, name)

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handeye_tri import arguments
 from handeye_tri.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -45,12 +46,18 @@ class Lens:
 
     def __post_init__(self) -> None:
         """Lock the coefficients; raise InputError where their number is wrong."""
-        if self.model not in LENS_COEFFICIENTS:
+        if not isinstance(self.model, str) or self.model not in LENS_COEFFICIENTS:
             raise InputError(
                 f"lens model {self.model!r} is not known; "
                 f"use one of {', '.join(LENS_COEFFICIENTS)}"
             )
-        values = np.array(self.coefficients, dtype=float)
+        try:
+            values = np.array(self.coefficients, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(
+                "coefficients of a lens must be numbers, got "
+                + arguments.shown(self.coefficients)
+            ) from None
         if values.shape != (len(self.names),) or not np.isfinite(values).all():
             raise InputError(
                 f"a {self.model} lens takes {len(self.names)} finite coefficients "

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handeye_tri import arguments
 from handeye_tri.camera.lens import LENS_COEFFICIENTS, Lens, distort_jacobians
 from handeye_tri.errors import InputError
 
@@ -35,6 +37,9 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         """Raise InputError where a value is not finite or a focal length <= 0."""
+        given = [getattr(self, name) for name in INTRINSIC_NAMES]
+        if not all(isinstance(value, Real) for value in given):
+            raise InputError(f"intrinsics must be numbers, got {given}")
         values = self.vector
         if not np.isfinite(values).all() or self.fx <= 0 or self.fy <= 0:
             raise InputError(
@@ -108,14 +113,12 @@ class PinholeCamera:
     lens: Lens = field(default_factory=Lens)
 
     def __post_init__(self) -> None:
-        """Raise InputError where the image size is not two positive integers."""
-        size = tuple(self.image_size)
-        if len(size) != 2 or any(int(n) != n or n < 1 for n in size):
-            raise InputError(
-                f"camera {self.name!r}: image_size must be (width, height) in whole "
-                f"pixels, got {self.image_size}"
-            )
-        object.__setattr__(self, "image_size", (int(size[0]), int(size[1])))
+        """Raise InputError where name or image size is none."""
+        arguments.title("name", self.name)
+        size = arguments.image_size(
+            f"camera {self.name!r}: image_size", self.image_size
+        )
+        object.__setattr__(self, "image_size", size)
 
     def project(self, points: ArrayLike) -> Floats:
         """Pixels, shape (..., 2), of points in the camera frame, (..., 3), metres.

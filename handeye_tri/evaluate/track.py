@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri import arguments
 from handeye_tri.adjustment import RobotParameters
 from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
 from handeye_tri.camera import triangulate
@@ -187,6 +188,8 @@ def _evaluate(
     session: Session,
     robot_parameters: RobotParameters | None,
 ) -> _Rows:
+    arguments.record("calibration", calibration, HandEyeCalibration)
+    arguments.record("session", session, Session)
     names = [camera.name for camera in calibration.cameras]
     expected = [info.name for info in session.cameras]
     if names != expected:

@@ -8,11 +8,13 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handeye_tri import arguments
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.hand_eye.consensus import find_consensus
 from handeye_tri.hand_eye.degeneracy import require_determined
 from handeye_tri.hand_eye.motions import check_pairs
 from handeye_tri.hand_eye.refine import Refinement, refine_axzb
+from handeye_tri.records import numeric
 from handeye_tri.se3 import SE3, nearest_rotation
 
 Floats = NDArray[np.float64]
@@ -69,10 +71,9 @@ def solve_axzb(
         DegenerateMotionError: parallel axes, or ambiguous half-turns.
         ConvergenceError: the refinement did not converge.
     """
-    if method not in ABSOLUTE_METHODS:
-        raise InputError(
-            f"method {method!r} is not known; use one of {', '.join(ABSOLUTE_METHODS)}"
-        )
+    arguments.check_one_of("method", method, ABSOLUTE_METHODS)
+    arguments.flag("robust", robust)
+    arguments.seed("seed", seed)
     left, right = check_pairs(a, b, 3)
     given = covariance_a is not None or covariance_b is not None
     if given and method != "refined":
@@ -107,7 +108,7 @@ def solve_axzb(
 def _covariances(name: str, value: ArrayLike | None, n: int) -> Floats:
     if value is None:
         return np.zeros((n, 6, 6))
-    covariance = np.asarray(value, dtype=float)
+    covariance = numeric(name, value)
     if covariance.shape not in {(6, 6), (n, 6, 6)}:
         raise InputError(
             f"{name} must have shape (6, 6) or ({n}, 6, 6), got {covariance.shape}"

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri import arguments
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.hand_eye.absolute import solve_axzb
 from handeye_tri.hand_eye.motions import relative_motions
@@ -63,6 +64,8 @@ def calibrate_hand_eye(
         DegenerateMotionError: the stations do not determine the motions.
         ConvergenceError: an iteration did not settle.
     """
+    arguments.record("session", session, Session)
+    arguments.record("cameras", cameras, CameraCalibration)
     names = tuple(camera.name for camera in cameras.cameras)
     expected = tuple(info.name for info in session.cameras)
     if names != expected:

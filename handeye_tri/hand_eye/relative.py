@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handeye_tri.errors import InputError
+from handeye_tri import arguments
 from handeye_tri.hand_eye.degeneracy import require_determined
 from handeye_tri.hand_eye.motions import (
     check_pairs,
@@ -59,10 +59,7 @@ def solve_axxb(
         InputError: unequal counts, fewer than two, NaN, or not rotations.
         DegenerateMotionError: parallel axes, or ambiguous half-turns.
     """
-    if method not in RELATIVE_METHODS:
-        raise InputError(
-            f"method {method!r} is not known; use one of {', '.join(RELATIVE_METHODS)}"
-        )
+    arguments.check_one_of("method", method, RELATIVE_METHODS)
     left, right = check_pairs(a, b, 2)
     start = _linear_rotation(left, right)
     if method == "andreff":

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri import arguments
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.hand_eye.absolute import AbsoluteMethod, solve_axzb
 from handeye_tri.hand_eye.clock import RobotTrack, correlate_clocks
@@ -76,10 +77,11 @@ def solve_pose_pairs(
             poses have.
         ConvergenceError: an iteration did not settle.
     """
-    if method not in PAIR_METHODS:
-        raise InputError(
-            f"method {method!r} is not known; use one of {', '.join(PAIR_METHODS)}"
-        )
+    arguments.record("pairs", pairs, PosePairs)
+    arguments.check_one_of("method", method, PAIR_METHODS)
+    arguments.seed("seed", seed)
+    if shift_along_axis is not None:
+        arguments.number("shift_along_axis", shift_along_axis)
     data, rows, offset, correlation = read_pairs(pairs)
     poses = tuple(name for name, row in zip(pairs.names, rows, strict=True) if row)
     if method != "likelihood":

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handeye_tri.arguments import shown
 from handeye_tri.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -30,11 +31,8 @@ def numeric(name: str, value: ArrayLike) -> Floats:
             raise TypeError
         return array.astype(float)
     except (TypeError, ValueError):
-        shown = repr(value)
-        if len(shown) > 60:
-            shown = shown[:57] + "..."
         raise InputError(
-            f"{name} must be real numbers, in lists of equal length; got {shown}"
+            f"{name} must be real numbers, in lists of equal length; got {shown(value)}"
         ) from None
 
 

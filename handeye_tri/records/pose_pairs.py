@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
 
+from handeye_tri import arguments
 from handeye_tri.errors import InputError
 from handeye_tri.records.arrays import Floats, locked
 from handeye_tri.se3 import se3_inverse
@@ -37,6 +39,7 @@ class PoseNoise:
     def __post_init__(self) -> None:
         """Raise InputError unless both chains together have noise everywhere."""
         for name, value in self.items():
+            arguments.number(f"noise.{name}", value)
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"noise.{name} must not be negative, got {value}")
         if self.robot_translation + min(self.lateral, self.depth) <= 0:
@@ -93,11 +96,12 @@ class PosePairs:
             ("robot_direction", RobotDirection),
             ("observed_direction", ObservedDirection),
         ):
-            if getattr(self, key) not in get_args(known):
-                raise InputError(
-                    f"{key} must be one of {', '.join(get_args(known))}, "
-                    f"got {getattr(self, key)!r}"
-                )
+            arguments.check_one_of(key, getattr(self, key), get_args(known))
+        arguments.flag("metric", self.metric)
+        if isinstance(self.names, str) or not isinstance(self.names, Sequence):
+            raise InputError(
+                "names must be a sequence of names, got " + arguments.shown(self.names)
+            )
         for key in ("robot", "observed"):
             value = locked(key, getattr(self, key), (None, 4, 4), finite=False)
             object.__setattr__(self, key, value)

@@ -9,6 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri import arguments
 from handeye_tri.camera import LENS_COEFFICIENTS
 from handeye_tri.errors import InputError
 from handeye_tri.records.arrays import Floats, locked
@@ -156,7 +157,13 @@ class CameraInfo:
     lens_model: Literal["radtan", "rational"] = "radtan"
 
     def __post_init__(self) -> None:
-        """Raise InputError where the lens model or a coefficient is not known."""
+        """Raise InputError where a field cannot be used."""
+        arguments.title("name of a camera", self.name)
+        size = arguments.image_size(
+            f"camera {self.name!r}: image_size", self.image_size
+        )
+        object.__setattr__(self, "image_size", size)
+        arguments.flag(f"camera {self.name!r}: skew", self.skew)
         known = LENS_COEFFICIENTS.get(self.lens_model, ())
         if not known or not set(self.lens) <= set(known):
             raise InputError(

@@ -331,3 +331,23 @@ def test_errors_are_as_large_as_predicted(options, chosen):
     assert np.sqrt(np.mean(tracks) / np.mean(predicted)) == pytest.approx(1, abs=0.15)
     # dof of 235: 0.092 for one, 0.017 for the mean of 30.
     assert np.mean(chi2) == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [
+        ("session", None),
+        ("start", "cell"),
+        ("side_sigma", "0.1"),
+        ("side_sigma", True),
+        ("side_sigma", -1.0),
+        ("loss", "huber"),
+        ("robot_parameters", ["elbow.offset"]),
+        ("on_axis_correlation", "0.5"),
+        ("on_axis_correlation", 1.0),
+    ],
+)
+def test_an_argument_of_the_wrong_kind_is_named(argument, value):
+    session, _, start = adjust_scene.cell(1, half_turns=3, sigma_px=0.1)
+    with pytest.raises(InputError, match=f"^{argument} must be "):
+        adjust(**{"session": session, "start": start, argument: value})

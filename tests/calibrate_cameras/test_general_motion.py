@@ -205,7 +205,7 @@ def apart(pixels):
         (lambda p: {"pixels": "image"}, {}, InputError, "points must be real numbers"),
         (lambda p: {"pixels": p * np.inf}, {}, InputError, "'camera0' saw no marker"),
         (near, {}, InputError, r"points\[0\] has markers A and B less than 0.5 px"),
-        (None, {"sigma_px": "a"}, InputError, "sigma_px must be real numbers"),
+        (None, {"sigma_px": "a"}, InputError, "sigma_px must be a positive"),
         (
             None,
             {"covariance": np.tile(-np.eye(2), (3, 22, 3, 1, 1))},

@@ -90,7 +90,7 @@ def test_derivatives(lens: Lens) -> None:
         step = np.zeros(5)
         step[i] = h = 1e-4 * size
         plus, minus = (
-            PinholeCamera("", Intrinsics.from_vector(v), (1, 1), lens).project(p)
+            PinholeCamera("c", Intrinsics.from_vector(v), (1, 1), lens).project(p)
             for v in (SKEWED.vector + step, SKEWED.vector - step)
         )
         # Linear in these unknowns: only rounding, eps * 1000 px / 1e-4.
@@ -99,7 +99,7 @@ def test_derivatives(lens: Lens) -> None:
         step = np.zeros(len(lens.coefficients))
         step[i] = 1e-5
         plus, minus = (
-            PinholeCamera("", SKEWED, (1, 1), Lens(lens.model, v)).project(p)
+            PinholeCamera("c", SKEWED, (1, 1), Lens(lens.model, v)).project(p)
             for v in (lens.coefficients + step, lens.coefficients - step)
         )
         assert np.abs(difference(plus, minus, 1e-5) - by_lens[..., i]).max() < 1e-7
