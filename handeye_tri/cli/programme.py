@@ -31,28 +31,51 @@ _LAYOUTS = ("csv", "json", "joint_trajectory", "urscript")
     show_default=True,
     help="Seconds that the robot stands at a station.",
 )
+@click.option(
+    "--then",
+    type=click.Path(path_type=Path),
+    help="Another planned session, driven after a tool change.",
+)
 @click.option("--even-if-failed", is_flag=True, help="Whatever the plan's verdict.")
 def programme(
-    session: Path, layout: str, output: Path, dwell: float, even_if_failed: bool
+    session: Path,
+    layout: str,
+    output: Path,
+    dwell: float,
+    then: Path | None,
+    even_if_failed: bool,
 ) -> None:
     """Write a session's plan as a programme that a robot can run.
 
-    FORMAT: csv (joints by station), json, joint_trajectory (ROS 2), urscript.
+    FORMAT: csv (joints by station), json, joint_trajectory (ROS 2), urscript. With
+    --then, a normal rig and an edge rig, say, are driven in one programme.
     """
     from handeye_tri.pipeline import NullProgress, Run
     from handeye_tri.pipeline.programme import planned_outcome, write_programme
     from handeye_tri.storage import SessionFolder
 
     cap_threads()
-    run = Run(SessionFolder.open(session), NullProgress())
-    outcome = planned_outcome(run)
-    if outcome != "PASS" and not even_if_failed:
+    runs = []
+    for folder in (session, *([] if then is None else [then])):
+        run = Run(SessionFolder.open(folder), NullProgress())
+        outcome = planned_outcome(run)
+        if outcome != "PASS" and not even_if_failed:
+            click.echo(
+                f"error: {folder}: the plan's verdict is {outcome}, so no programme is "
+                f"written; see handeye-tri plan {folder}, or add --even-if-failed",
+                err=True,
+            )
+            sys.exit(EXIT_CODES[outcome])
+        runs.append((run, outcome))
+    written = write_programme(
+        runs[0][0], layout, output, dwell, runs[1][0] if then else None
+    )
+    for run, outcome in runs:
+        whose = f" of {run.cell.name}" if then else ""
+        click.echo(f"VERDICT{whose}  {outcome} (expected, before the robot moves)")
+    if written.change is not None:
         click.echo(
-            f"error: {session}: the plan's verdict is {outcome}, so no programme is "
-            f"written; see handeye-tri plan {session}, or add --even-if-failed",
-            err=True,
+            f"{written.change}; the robot waits for it in its home after "
+            f"{written.change.before} of {len(written.stops)} stations"
         )
-        sys.exit(EXIT_CODES[outcome])
-    write_programme(run, layout, output, dwell)
-    click.echo(f"VERDICT  {outcome} (expected, before the robot moves)")
     click.echo(f"wrote {output}")

@@ -20,6 +20,29 @@ _BLEND = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ToolChange:
+    """Where the robot waits until a person has mounted another rig.
+
+    Attributes:
+        before: Number of the first station with the new rig, at least 1.
+        joints: Where the robot waits, shape (q,), rad or m.
+        via: Joints passed on the way there from the station before, shape (k, q).
+        tools: What the rigs are called, the one taken off first.
+        mount: What is to be mounted, in a few words.
+    """
+
+    before: int
+    joints: Floats
+    via: Floats
+    tools: tuple[str, str]
+    mount: str
+
+    def __str__(self) -> str:
+        """What a person must do."""
+        return f"tool change: take off {self.tools[0]}, mount {self.mount}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Programme:
     """Stations in the order driven, and the joint moves between them.
 
@@ -35,6 +58,7 @@ class Programme:
         speed: Speed limits, shape (q,), rad/s or m/s.
         acceleration_time: From rest to full speed, seconds.
         dwell: How long the robot stands at a station, seconds.
+        change: Where the rig is exchanged; None: one rig throughout.
     """
 
     head: tuple[str, ...]
@@ -47,6 +71,7 @@ class Programme:
     speed: Floats
     acceleration_time: float
     dwell: float
+    change: ToolChange | None = None
 
     def __post_init__(self) -> None:
         """Raise InputError where the dwell time is none."""
@@ -61,11 +86,34 @@ class Programme:
     def leg(self, station: int) -> Floats:
         """Where the way to a station leads, from the stop before, shape (k + 2, q)."""
         start = self.stops[station - 1] if station else self.home
+        if self.change is not None and self.change.before == station:
+            start = self.change.joints
         return np.concatenate([start[None], self.via[station], self.stops[[station]]])
+
+    def way_to_change(self, station: int) -> Floats | None:
+        """Where the way to a tool change before this station leads, (k + 2, q)."""
+        change = self.change
+        if change is None or change.before != station:
+            return None
+        start = self.stops[[station - 1]]
+        return np.concatenate([start, change.via, change.joints[None]])
+
+    def called(self, station: int) -> str:
+        """A station's number, by rig where there are two."""
+        if self.change is None:
+            return str(station)
+        after = station >= self.change.before
+        number = station - self.change.before if after else station
+        return f"{number} of {self.change.tools[int(after)]}"
 
 
 def programme_json(programme: Programme) -> str:
-    """The stations with their joints by name, rad or m."""
+    """The stations with their joints by name, rad or m.
+
+    ``tool_change`` is there where the rig is exchanged, before the station that
+    ``before_station`` names by its index.
+    """
+    change = programme.change
     data = {
         "schema": PROGRAMME_SCHEMA,
         "notice": programme.head,
@@ -83,6 +131,14 @@ def programme_json(programme: Programme) -> str:
             for k, kind in enumerate(programme.kinds)
         ],
     }
+    if change is not None:
+        data["tool_change"] = {
+            "before_station": change.before,
+            "via": change.via.tolist(),
+            "joints": change.joints.tolist(),
+            "take_off": change.tools[0],
+            "mount": change.mount,
+        }
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
@@ -94,31 +150,56 @@ def joint_trajectory_yaml(programme: Programme) -> str:
     in step: straight in joint space, with 1.5 times the mean speed in the middle and
     6 times the distance over the squared time at the ends. The times keep both in
     the limits.
+
+    A trajectory cannot wait for a person: with a tool change there are two messages,
+    a YAML document each, to be sent one after the other.
     """
     lines = [f"# {line}" for line in programme.head]
     lines += [
         f"# Points at rest; {programme.dwell:g} s at each station. rad or m, seconds.",
-        "header:",
-        "  frame_id: ''",
-        f"joint_names: [{', '.join(programme.joint_names)}]",
-        "points:",
-        *_point(programme.home, 0.0),
+        *_message(programme, programme.home),
     ]
-    speed, acceleration = programme.speed, programme.acceleration
     now = 0.0
     for k in range(len(programme.stops)):
+        to_change = programme.way_to_change(k)
+        if to_change is not None:
+            now = _moves(programme, to_change, now, lines)
+            lines += [
+                "---",
+                f"# {programme.change}; then send this second message.",
+                *_message(programme, to_change[-1]),
+            ]
+            now = 0.0
         leg = programme.leg(k)
-        for start, end in pairwise(leg):
-            distance = np.abs(end - start)
-            slowest = np.maximum(
-                1.5 * distance / speed, np.sqrt(6 * distance / acceleration)
-            )
-            now += max(float(slowest.max()), 1e-3)
-            lines += _point(end, now)
+        now = _moves(programme, leg, now, lines)
         if programme.dwell > 0:
             now += programme.dwell
             lines += _point(leg[-1], now)
     return "\n".join(lines) + "\n"
+
+
+def _message(programme: Programme, start: Floats) -> list[str]:
+    """How a message begins, at joints ``start``."""
+    return [
+        "header:",
+        "  frame_id: ''",
+        f"joint_names: [{', '.join(programme.joint_names)}]",
+        "points:",
+        *_point(start, 0.0),
+    ]
+
+
+def _moves(programme: Programme, leg: Floats, now: float, lines: list[str]) -> float:
+    """Add the points of a leg after moment ``now``; when it ends, seconds."""
+    for start, end in pairwise(leg):
+        distance = np.abs(end - start)
+        slowest = np.maximum(
+            1.5 * distance / programme.speed,
+            np.sqrt(6 * distance / programme.acceleration),
+        )
+        now += max(float(slowest.max()), 1e-3)
+        lines += _point(end, now)
+    return now
 
 
 def _point(joints: Floats, time: float) -> list[str]:
@@ -136,7 +217,8 @@ def urscript(programme: Programme) -> str:
     """A URScript programme: moves, blended where they pass a point, and stops.
 
     ``movej`` takes speed and acceleration of the joint that travels farthest; both
-    are chosen so that every joint stays within its own limits.
+    are chosen so that every joint stays within its own limits. At a tool change a
+    popup holds the programme until a person lets it go on.
 
     Raises:
         InputError: the arm does not have six hinges.
@@ -152,19 +234,34 @@ def urscript(programme: Programme) -> str:
     start = _joints(programme.home)
     lines += [f"  movej({start}, a={acceleration.min():.6g}, v={speed.min():.6g})"]
     for k, kind in enumerate(programme.kinds):
-        lines.append(f"  # station {k}, {kind}")
-        leg = programme.leg(k)
-        for number, (start, end) in enumerate(pairwise(leg), 2):
-            share = np.abs(end - start) / max(float(np.abs(end - start).max()), 1e-12)
-            share = np.maximum(share, 1e-12)
-            blend = "" if number == len(leg) else f", r={_BLEND}"
+        to_change = programme.way_to_change(k)
+        if to_change is not None:
+            lines += [f"  # {programme.change}", *_script_moves(programme, to_change)]
             lines.append(
-                f"  movej({_joints(end)}, a={(acceleration / share).min():.6g}, "
-                f"v={(speed / share).min():.6g}{blend})"
+                f'  popup("{programme.change}", title="Tool change", warning=True, '
+                "blocking=True)"
             )
-        lines += [f'  textmsg("station ", {k})', f"  sleep({programme.dwell:g})"]
+        called = programme.called(k)
+        lines += [f"  # station {called}, {kind}"]
+        lines += _script_moves(programme, programme.leg(k))
+        told = str(k) if programme.change is None else f'"{called}"'
+        lines += [f'  textmsg("station ", {told})', f"  sleep({programme.dwell:g})"]
     lines += ["end", "calibration_programme()"]
     return "\n".join(lines) + "\n"
+
+
+def _script_moves(programme: Programme, leg: Floats) -> list[str]:
+    """The moves along a leg, blended at the points passed."""
+    lines = []
+    for number, (start, end) in enumerate(pairwise(leg), 2):
+        share = np.abs(end - start) / max(float(np.abs(end - start).max()), 1e-12)
+        share = np.maximum(share, 1e-12)
+        blend = "" if number == len(leg) else f", r={_BLEND}"
+        lines.append(
+            f"  movej({_joints(end)}, a={(programme.acceleration / share).min():.6g}, "
+            f"v={(programme.speed / share).min():.6g}{blend})"
+        )
+    return lines
 
 
 def _joints(values: Floats) -> str:

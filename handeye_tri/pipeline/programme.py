@@ -18,6 +18,7 @@ from handeye_tri.exchange.robot_programme import (
 from handeye_tri.pipeline.execution import require
 from handeye_tri.pipeline.run import Run
 from handeye_tri.pipeline.stages import stages_of
+from handeye_tri.pipeline.tool_change import check_other_rig, with_tool_change
 from handeye_tri.records import Floats, Plan
 
 # What each is for, in a few words.
@@ -103,20 +104,33 @@ def planned_outcome(run: Run) -> str:
     return run.plan().outcome
 
 
-def write_programme(run: Run, layout: str, path: Path, dwell: float) -> None:
-    """Write the plan of a session.
+def write_programme(
+    run: Run, layout: str, path: Path, dwell: float, then: Run | None = None
+) -> Programme:
+    """Write the plan of a session, or of two with a tool change between them.
 
     Args:
         run: A session that is planned.
         layout: One of LAYOUTS.
         path: The file.
         dwell: How long the robot stands at a station, seconds.
+        then: Another planned session of the same arm and cameras, with another rig.
+
+    Returns:
+        What was written.
 
     Raises:
-        InputError: the layout is unknown or cannot hold the programme.
+        InputError: the layout is unknown or cannot hold the programme, or the two
+            sessions differ in more than their rigs.
         StorageError: there is no plan, or the file cannot be written.
     """
-    _write(_programme(run, run.plan(), run.arm.home, dwell), layout, path)
+    programme = _programme(run, run.plan(), run.arm.home, dwell)
+    if then is not None:
+        check_other_rig(run, then)
+        second = _programme(then, then.plan(), then.arm.home, dwell)
+        programme = with_tool_change(programme, second, run, then)
+    _write(programme, layout, path)
+    return programme
 
 
 def _programme(run: Run, plan: Plan, start: Floats, dwell: float) -> Programme:
@@ -145,6 +159,11 @@ def _programme(run: Run, plan: Plan, start: Floats, dwell: float) -> Programme:
 def _write(programme: Programme, layout: str, path: Path) -> None:
     """A programme in one of LAYOUTS."""
     if layout == "csv":
+        if programme.change is not None:
+            raise InputError(
+                "csv holds stations only, and this programme changes the tool; "
+                "choose json, joint_trajectory or urscript"
+            )
         if any(len(points) for points in programme.via):
             raise InputError(
                 "csv holds stations only, and this plan passes points between them; "

@@ -11,6 +11,7 @@ from ruamel.yaml import YAML
 from handeye_tri.errors import InputError
 from handeye_tri.exchange.robot_programme import (
     Programme,
+    ToolChange,
     joint_trajectory_yaml,
     programme_json,
     urscript,
@@ -112,3 +113,62 @@ def test_urscript_is_for_six_hinges():
 def test_dwell_must_be_a_time(dwell):
     with pytest.raises(InputError, match="dwell must be 0 s or longer"):
         replace(PROGRAMME, dwell=dwell)
+
+
+CHANGE = ToolChange(
+    before=3,
+    joints=np.full(6, 0.25),
+    via=RNG.uniform(-1, 1, (2, 6)),
+    tools=("the first rig", "the other rig"),
+    mount="the other rig (as described)",
+)
+CHANGED = replace(PROGRAMME, change=CHANGE)
+STATED = "tool change: take off the first rig, mount the other rig (as described)"
+
+
+def changed_way():
+    """All points of the programme with a tool change, shape (n, 6)."""
+    parts = [PROGRAMME.home[None]]
+    for k, (via, stop) in enumerate(zip(PROGRAMME.via, PROGRAMME.stops, strict=True)):
+        parts += [CHANGE.via, CHANGE.joints[None]] if k == 3 else []
+        parts += [via, stop[None]]
+    return np.concatenate(parts)
+
+
+def test_json_states_the_tool_change_where_it_belongs():
+    assert "tool_change" not in json.loads(programme_json(PROGRAMME))
+    change = json.loads(programme_json(CHANGED))["tool_change"]
+    assert change["before_station"] == 3
+    assert change["joints"] == CHANGE.joints.tolist()
+    assert change["via"] == CHANGE.via.tolist()
+    assert (change["take_off"], change["mount"]) == (CHANGE.tools[0], CHANGE.mount)
+
+
+def test_a_trajectory_ends_at_the_tool_change_and_another_begins_there():
+    text = joint_trajectory_yaml(CHANGED)
+    assert f"---\n# {STATED}; then send this second message.\n" in text
+    first, second = YAML(typ="safe").load_all(text)
+    rows = [
+        [p["positions"] for p in data["points"]]
+        for data in (first, second)
+        if data["joint_names"] == list("slurbt")
+    ]
+    assert rows[0][-1] == rows[1][0] == CHANGE.joints.tolist()
+    points = np.array([*rows[0], *rows[1]])
+    moving = np.abs(np.diff(points, axis=0)).max(axis=1) > 0
+    np.testing.assert_array_equal(points[np.r_[True, moving]], changed_way())
+    start = second["points"][0]["time_from_start"]
+    assert (start["sec"], start["nanosec"]) == (0, 0)
+
+
+def test_urscript_waits_for_a_person_at_the_tool_change():
+    text = urscript(CHANGED)
+    moves = re.findall(r"movej\(\[(.*?)\]", text)
+    joints = np.array([[float(v) for v in m.split(",")] for m in moves])
+    np.testing.assert_allclose(joints, changed_way(), atol=1e-9)
+    before, after = text.split(
+        f'  popup("{STATED}", title="Tool change", warning=True, blocking=True)\n'
+    )
+    assert before.count("sleep(") == 3
+    assert 'textmsg("station ", "2 of the first rig")' in before
+    assert 'textmsg("station ", "0 of the other rig")' in after

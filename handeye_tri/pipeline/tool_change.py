@@ -1,0 +1,112 @@
+"""Two sessions of one arm and its cameras, each with its rig, as one programme."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from handeye_tri import storage
+from handeye_tri.arm import Arm
+from handeye_tri.config import RigConfig
+from handeye_tri.errors import InputError
+from handeye_tri.exchange.robot_programme import Programme, ToolChange
+from handeye_tri.pipeline.run import Run
+from handeye_tri.records import Floats
+
+# What may differ between the two cells: what they are called, the rig, what is planned.
+_MAY_DIFFER = ("name", "rig", "plan", "imaging")
+
+
+def check_other_rig(run: Run, then: Run) -> None:
+    """See that two sessions are of the same arm and cameras, with different rigs.
+
+    Raises:
+        InputError: they are not; names what differs.
+    """
+    first, second = (
+        r.designed_cell.model_dump(mode="json", by_alias=True) for r in (run, then)
+    )
+    where = f"{run.folder.path} and {then.folder.path}"
+    for key in first:
+        if key not in _MAY_DIFFER and first[key] != second[key]:
+            raise InputError(
+                f"{where}: a tool change leaves all but the rig as it is, but "
+                f"{_differing(key, first[key], second[key])} differs; plan both in "
+                "cells that differ in name, rig and plan only"
+            )
+    if storage.sha256(run.model_path) != storage.sha256(then.model_path):
+        raise InputError(f"{where}: the arm's model files differ; plan both with one")
+    if first["rig"] == second["rig"] or first["name"] == second["name"]:
+        same = "rig" if first["rig"] == second["rig"] else "name"
+        raise InputError(
+            f"{where}: both cells have the {same} {first[same]}; a tool change goes to "
+            "another rig, in a cell of another name"
+        )
+
+
+def _differing(key: str, first: Any, second: Any) -> str:
+    """The first key inside of two different values, dotted."""
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        for inner in first:
+            if first[inner] != second.get(inner):
+                return _differing(f"{key}.{inner}", first[inner], second.get(inner))
+    return key
+
+
+def with_tool_change(
+    first: Programme, second: Programme, run: Run, then: Run
+) -> Programme:
+    """One programme: all stations of the first rig, a tool change, then the others.
+
+    The robot waits for it where both programmes start, in the arm's home, which both
+    plans found free with their own rig.
+    """
+    before, after = run.designed_cell, then.designed_cell
+    change = ToolChange(
+        before=len(first.stops),
+        joints=second.home,
+        via=way_back(run.arm, first),
+        tools=(f"the rig of {before.name}", f"the rig of {after.name}"),
+        mount=f"the rig of {after.name} ({described(after.rig)})",
+    )
+    return replace(
+        first,
+        head=(
+            *first.head[:-1],
+            f"{change}; the robot waits for it in its home after {change.before} of "
+            f"{len(first.stops) + len(second.stops)} stations",
+            *second.head,
+        ),
+        stops=np.concatenate([first.stops, second.stops]),
+        kinds=(*first.kinds, *second.kinds),
+        via=(*first.via, *second.via),
+        change=change,
+    )
+
+
+def described(rig: RigConfig) -> str:
+    """What a person must mount, in words."""
+    turns = "a normal" if rig.axis == "normal" else f"its edge {rig.axis}"
+    return (
+        f"half-turns about {turns}; AB {rig.side_ab_mm:g} mm, AC {rig.side_ac_mm:g} "
+        f"mm, {rig.angle_deg:g} degrees at A"
+    )
+
+
+def way_back(arm: Arm, programme: Programme) -> Floats:
+    """Joints passed on a free way from the last station home, shape (k, q).
+
+    Back along the way that was driven, up to where home is straight ahead; all of
+    that way is free, so there is always one.
+    """
+    driven = np.concatenate(
+        [programme.home[None]]
+        + [programme.leg(k)[1:] for k in range(len(programme.stops))]
+    )[::-1]
+    for count in range(1, len(driven)):
+        if arm.path_collision(driven[count - 1], driven[-1]) is None:
+            return np.asarray(driven[1:count])
+    return np.asarray(driven[1:-1])
