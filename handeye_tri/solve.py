@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from handeye_tri.counting import counted
 from handeye_tri.diagnose import Verdict, assess_pose_pairs
-from handeye_tri.errors import ConvergenceError
+from handeye_tri.errors import ConvergenceError, InputError
 from handeye_tri.hand_eye import (
     PairMethod,
     PoseSolution,
@@ -71,10 +71,17 @@ def solve_and_judge(
         seed: Of the random samples.
 
     Raises:
-        InputError: see :func:`handeye_tri.hand_eye.solve_pose_pairs`.
+        InputError: a limit is not positive; see
+            :func:`handeye_tri.hand_eye.solve_pose_pairs`.
         DegenerateMotionError: see there.
         ConvergenceError: see there.
     """
+    for name, limit in (
+        ("limit_position", limit_position),
+        ("limit_angle", limit_angle),
+    ):
+        if not 0 < limit < np.inf:
+            raise InputError(f"{name} must be positive, got {limit:g}")
     solution = solve_pose_pairs(
         pairs, method=method, shift_along_axis=shift_along_axis, seed=seed
     )

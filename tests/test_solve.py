@@ -15,6 +15,7 @@ from handeye_tri.se3 import (
     se3_exp,
     se3_inverse,
     so3_exp,
+    so3_log,
 )
 from handeye_tri.solve import solve_and_judge, solved_json, solved_text
 
@@ -196,6 +197,57 @@ def test_inverted_poses_and_swapped_mounting_are_named_together(source, what):
     assert inverted.key == "inverted"
     assert stated.misfit > 20 * inverted.misfit
     assert ("flange_in_base" if what == "robot" else "base_in_flange") in cause
+
+
+def transposed(poses):
+    result = np.array(poses)
+    result[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    return result
+
+
+def mirrored(poses):
+    mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
+    return mirror @ poses @ mirror
+
+
+@pytest.mark.parametrize(
+    ("spoil_robot", "spoil_observed", "cause"),
+    [
+        (transposed, np.array, "the robot poses' rotations are transposed"),
+        (np.array, transposed, "the observed poses' rotations are transposed"),
+        (transposed, transposed, "both sides' rotations are transposed"),
+        (mirrored, np.array, "left-handed"),
+        (np.array, mirrored, "left-handed"),
+    ],
+)
+@pytest.mark.parametrize("inverse", [False, True])
+@pytest.mark.parametrize("mounting", OPPOSITE)
+def test_wrong_rotations_at_right_places_are_named(
+    spoil_robot, spoil_observed, cause, inverse, mounting
+):
+    robot, observed, *_ = simulated(mounting)
+    directions = {}
+    if inverse:
+        robot, observed = se3_inverse(robot), se3_inverse(observed)
+        directions["robot_direction"] = "base_in_flange"
+        directions["observed_direction"] = "camera_in_target"
+    solved = judge(spoil_robot(robot), spoil_observed(observed), mounting, **directions)
+    assert solved.verdict.outcome == "FAIL"
+    assert cause in solved.verdict.sentence
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_sides_that_turn_by_other_angles_are_named_with_them(side):
+    *both, mounting, _, _ = simulated("eye_in_hand")
+    # Radians that were read as degrees.
+    turns = so3_log(both[side][:, :3, :3])
+    both[side] = np.array(both[side])
+    both[side][:, :3, :3] = so3_exp(np.radians(turns))
+    solved = judge(*both, mounting)
+    assert solved.verdict.outcome in ("FAIL", "CANNOT TELL")
+    assert "do not turn alike" in solved.verdict.sentence
+    assert "MOTION" not in codes(solved)
+    assert any("degrees or radians" in one.remedy for one in solved.verdict.findings)
 
 
 @pytest.mark.parametrize("by", [1, -1])
@@ -465,6 +517,18 @@ def call(capsys, *arguments):
         cli.main([str(argument) for argument in arguments])
     out, err = capsys.readouterr()
     return left.value.code, out, err
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--limit-mm", "-1"), ("--limit-deg", "0"), ("--limit-mm", "nan"), ("--seed", -1)],
+)
+def test_numbers_that_cannot_be_are_refused(capsys, tmp_path, option, value):
+    robot, observed, mounting, *_ = simulated("eye_in_hand")
+    path = write(tmp_path / "poses.json", robot, observed, mounting)
+    code, out, err = call(capsys, "solve", path, option, value)
+    assert (code, out) == (2, "")
+    assert f"{value}" in err
 
 
 def test_exit_codes_follow_the_verdict(capsys, tmp_path):

@@ -54,7 +54,13 @@ def _conclude(run: Run, *, as_json: bool) -> None:
     type=click.Path(path_type=Path),
     help="The session's folder; made where it is absent.",
 )
-@click.option("--seed", default=1, show_default=True, help="Seed of all randomness.")
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=1,
+    show_default=True,
+    help="Seed of all randomness.",
+)
 @click.option(
     "--half-turns",
     type=click.IntRange(min=2),
@@ -84,7 +90,13 @@ def run(
 @commands.command(epilog=example("handeye-tri plan out --cell hp3_stereo --seed 1"))
 @SESSION
 @click.option("--cell", help="Start a new session for this cell.")
-@click.option("--seed", default=1, show_default=True, help="Seed of a new session.")
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=1,
+    show_default=True,
+    help="Seed of a new session.",
+)
 @click.option(
     "--half-turns", type=click.IntRange(min=2), help="Half-turns of a new session."
 )

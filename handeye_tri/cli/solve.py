@@ -10,6 +10,9 @@ import click
 from handeye_tri.cli.group import EXIT_CODES, commands, example
 from handeye_tri.cli.progress import cap_threads
 
+# Such as 0.5, and neither inf nor nan.
+_POSITIVE = click.FloatRange(min=0, max=1e9, min_open=True)
+
 
 @commands.command(epilog=example("handeye-tri solve poses.json"))
 @click.argument("poses", type=click.Path(path_type=Path))
@@ -39,12 +42,26 @@ from handeye_tri.cli.progress import cap_threads
     help="Measured, where the poses leave it open (4-axis robots).",
 )
 @click.option(
-    "--limit-mm", default=10.0, show_default=True, help="Largest RMS position residual."
+    "--limit-mm",
+    type=_POSITIVE,
+    default=10.0,
+    show_default=True,
+    help="Largest RMS position residual.",
 )
 @click.option(
-    "--limit-deg", default=1.0, show_default=True, help="Largest RMS angle residual."
+    "--limit-deg",
+    type=_POSITIVE,
+    default=1.0,
+    show_default=True,
+    help="Largest RMS angle residual.",
 )
-@click.option("--seed", default=0, show_default=True, help="Of the random samples.")
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Of the random samples.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON only.")
 def solve(
     poses: Path,

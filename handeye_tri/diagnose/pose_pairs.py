@@ -19,6 +19,7 @@ from handeye_tri.diagnose.gates import (
 from handeye_tri.hand_eye.hypotheses import Reading
 from handeye_tri.hand_eye.pose_solution import PoseSolution, Undetermined
 from handeye_tri.records import PosePairs
+from handeye_tri.se3 import so3_log
 
 # Fewer poses leave so few redundant numbers that wrong input can fit by chance.
 _LEAST_POSES = 6
@@ -61,10 +62,11 @@ def assess_pose_pairs(
     """
     used = solution.used
     misread = _better_reading(readings)
+    unlike = "" if misread else _unlike_turns(solution, limit_angle)
     # Under a wrong reading no pose is wrong by itself.
     count = len(used) if misread else int(used.sum())
     gates = [
-        _motion_gate(solution, misread is not None),
+        _motion_gate(solution, misread is not None or unlike != ""),
         Gate(
             "enough poses",
             f"{count}",
@@ -109,7 +111,7 @@ def assess_pose_pairs(
     ]
     if misread is not None and misread.key == "scaled":
         gates.append(_scale_gate(misread.scale, 0.0))
-    elif scale is not None and misread is None:
+    elif scale is not None and misread is None and not unlike:
         gates.append(_scale_gate(*scale))
     if solution.clock_correlation is not None:
         use = _LEAST_CORRELATION / max(solution.clock_correlation, 1e-9)
@@ -126,12 +128,13 @@ def assess_pose_pairs(
             )
         )
     gates.append(touch_gate())
-    sentence = (
-        _sentence(solution)
-        if misread is None
-        else f"The poses contradict what is stated about them: {misread.meaning}."
-    )
-    verdict = judge(tuple(gates), sentence, _remedies(solution, readings))
+    if misread is not None:
+        sentence = f"The poses contradict what is stated about them: {misread.meaning}."
+    elif unlike:
+        sentence = f"The poses contradict each other: {unlike}."
+    else:
+        sentence = _sentence(solution)
+    verdict = judge(tuple(gates), sentence, _remedies(solution, readings, unlike))
     # Causes before what follows from them; so few poses that anything fits are one,
     # unless another reading stands out.
     few = "" if misread is not None and count > _FEWEST else "FEW"
@@ -153,6 +156,27 @@ def _better_reading(readings: tuple[Reading, ...]) -> Reading | None:
             return None
     floor = _FLOOR
     return best if stated.misfit + floor > _CLEARLY * (best.misfit + floor) else None
+
+
+def _unlike_turns(solution: PoseSolution, limit: float) -> str:
+    """In words, that the two sides do not turn by the same angles; empty if they do.
+
+    Whatever X and Z are, between two poses both sides turn by one angle.
+    """
+    used = solution.used
+    angles = []
+    for poses in (solution.base_from_flange[used], solution.b[used]):
+        rotations = poses[:, :3, :3]
+        way = so3_log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
+        angles.append(np.linalg.norm(way, axis=1))
+    # Each of the two poses may be off by the limit, noise by three times that.
+    if np.median(np.abs(angles[0] - angles[1])) < 6 * limit:
+        return ""
+    robot, observed = np.degrees(np.median(angles, axis=1))
+    return (
+        "robot and target do not turn alike, from pose to pose by "
+        f"{robot:.3g} deg and by {observed:.3g} deg (medians)"
+    )
 
 
 def _motion_gate(solution: PoseSolution, misread: bool) -> Gate:
@@ -274,7 +298,7 @@ def _sentence(solution: PoseSolution) -> str:
 
 
 def _remedies(
-    solution: PoseSolution, readings: tuple[Reading, ...]
+    solution: PoseSolution, readings: tuple[Reading, ...], unlike: str
 ) -> dict[str, Remedy]:
     others = [one for one in readings[1:] if one.key != "scaled"]
     best = min(others, key=lambda one: one.misfit)
@@ -306,8 +330,9 @@ def _remedies(
         ),
         "orientation residual, rms": (
             "RESIDUAL",
-            "robot and camera contradict each other in orientation",
-            "see the other readings below, and check the rotation format",
+            unlike or "robot and camera contradict each other in orientation",
+            "check the rotations' format (degrees or radians, order of a quaternion or "
+            "of Euler angles), and see the other readings below",
         ),
         "loop residual / expected": (
             "LOOP",

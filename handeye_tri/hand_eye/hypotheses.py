@@ -3,7 +3,8 @@
 Inverting one side's poses and swapping the mounting give the same equation: from
 ``A^-1 X = Z B`` follows ``A Z = X B^-1``. Three mistakes, one residual; all are named.
 Inverting both sides changes nothing but which unknown is which, so that no residual
-sees it.
+sees it. Where poses do not fit as stated, rotations are also read as transposed
+(matrices written column by column) and one side as left-handed.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ Floats = NDArray[np.float64]
 # Known factors between units that people confuse, metres per unit.
 _UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"))
 _UNIT_TOLERANCE = 0.1
+# Poses that fit to this share of the scene's length have the right rotations.
+_RIGHT = 0.02
+# Any mirror: which one is up to the unknown frames.
+_MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +37,8 @@ class Reading:
     """One way to read the poses, solved for most of them.
 
     Attributes:
-        key: "stated", "inverted", "later", "earlier" or "scaled".
+        key: "stated", "inverted", "later", "earlier", "scaled", or "transposed" or
+            "left-handed" with the side.
         meaning: What would be the case.
         position: Median position residual, metres.
         angle: Median orientation residual, radians.
@@ -98,6 +104,12 @@ def solve_readings(
                 free,
             ),
         ]
+    if stated.misfit > _RIGHT * scene_length(a):
+        others = (
+            _read(key, meaning, left, right, seed, free)
+            for key, meaning, left, right in _other_rotations(a, b, pairs)
+        )
+        found += [one for one in others if one.misfit <= _RIGHT * scene_length(a)]
     if pairs.metric:
         scaled = _read("scaled", "", a, b, seed, free_scale=True)
         found.append(
@@ -160,6 +172,36 @@ def _reading(
         float(np.median(misfits)),
         scale,
     )
+
+
+def _other_rotations(
+    a: Floats, b: Floats, pairs: PosePairs
+) -> list[tuple[str, str, Floats, Floats]]:
+    """Key, meaning and poses of readings with other rotations at the same places."""
+    robot = _transposed(a, pairs.robot_direction == "base_in_flange")
+    inverse = pairs.mounting == "eye_in_hand"
+    observed = _transposed(
+        b, inverse == (pairs.observed_direction == "target_in_camera")
+    )
+    wrong = "rotations are transposed (written column by column, or of the inverse)"
+    return [
+        ("transposed robot", f"the robot poses' {wrong}", robot, b),
+        ("transposed observed", f"the observed poses' {wrong}", a, observed),
+        ("transposed both", f"both sides' {wrong}", robot, observed),
+        (
+            "left-handed side",
+            "the frames of one side, robot or observed, are left-handed",
+            a,
+            _MIRROR @ b @ _MIRROR,
+        ),
+    ]
+
+
+def _transposed(poses: Floats, inverse: bool) -> Floats:
+    """Poses whose file holds transposed rotations; whether it holds their inverses."""
+    given = se3_inverse(poses) if inverse else np.array(poses)
+    given[:, :3, :3] = np.swapaxes(given[:, :3, :3], 1, 2).copy()
+    return se3_inverse(given) if inverse else given
 
 
 def _opposites(pairs: PosePairs) -> tuple[str, str, str]:

@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 
 # A matrix whose R'R is farther than this from the identity is no rotation.
 _ROTATION_TOLERANCE = 1e-6
+# Farther from a rotation than this is no rounding.
+_ROUNDED = 0.02
 # Poses checked at once: a cache full.
 _CHUNK = 1024
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
@@ -74,7 +76,8 @@ def check_motions(name: str, motions: ArrayLike, least: int) -> Floats:
         raise InputError(f"{name} must have shape (n, 4, 4), got {m.shape}")
     if len(m) < least:
         raise InputError(
-            f"{name} holds {counted(len(m), 'motion')}; at least {least} are needed"
+            f"{name} holds {counted(len(m), 'motion')}; at least {least} are needed: "
+            "record more poses"
         )
     # A sum is finite only if all its terms are.
     if not np.isfinite(m.sum()) and not np.isfinite(m).all():
@@ -93,10 +96,20 @@ def check_motions(name: str, motions: ArrayLike, least: int) -> Floats:
     defect, determinant = _rotation_defect(m)
     if defect.max() > _ROTATION_TOLERANCE or determinant.min() < 0:
         i = int(np.argmax(np.where(determinant < 0, np.inf, defect)))
+        if determinant[i] < 0:
+            raise InputError(
+                f"{name}[{i}] is not a rotation but a mirror image (determinant "
+                f"{determinant[i]:+.6f}); one axis has the wrong sign, or a frame is "
+                "left-handed"
+            )
         raise InputError(
             f"{name}[{i}] is not a rotation: R'R differs from I by {defect[i]:.2g} "
             f"(allowed {_ROTATION_TOLERANCE:g}), determinant {determinant[i]:+.6f}; "
-            "orthonormalise it first (handeye_tri.se3.nearest_rotation)"
+            + (
+                "orthonormalise it first (handeye_tri.se3.nearest_rotation)"
+                if defect[i] < _ROUNDED
+                else "that is too far for rounding: check how it was written"
+            )
         )
     return m
 

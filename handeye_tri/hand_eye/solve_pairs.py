@@ -189,17 +189,23 @@ def _start(
     """The input, X, Z and scale that most poses agree on, and which poses do."""
     a, _ = data.robot(offset)
     b = data.b
-    spread = a[:, :3, 3] - a[:, :3, 3].mean(axis=0)
-    turned = np.linalg.norm(so3_log(a[:, :3, :3] @ a[0, :3, :3].T), axis=1).max()
-    if np.abs(spread).max() < 1e-6 and turned < 1e-6:
-        raise DegenerateMotionError(
-            f"all {len(a)} robot poses are the same (within 1 um and 1 urad): nothing "
-            "is determined; record poses that turn by 20 degrees or more about two "
-            "different axes"
-        )
+    for name, poses in (("robot", a), ("observed", b)):
+        if _are_the_same(poses):
+            raise DegenerateMotionError(
+                f"all {len(a)} {name} poses are the same (within 1 um and 1 urad): "
+                "nothing is determined; record poses that turn by 20 degrees or more "
+                "about two different axes"
+            )
     found = find_start(a, b, free_scale=data.free_scale, seed=seed)
     data = replace(data, few_axes=found.few_axes)
     return data, found.x, found.z, found.scale, found.agreeing
+
+
+def _are_the_same(poses: Floats) -> bool:
+    """Within 1 um and 1 urad."""
+    apart = np.abs(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)).max()
+    turned = so3_log(poses[:, :3, :3] @ poses[0, :3, :3].T)
+    return bool(apart < 1e-6 and np.linalg.norm(turned, axis=1).max() < 1e-6)
 
 
 def _fit_and_drop(

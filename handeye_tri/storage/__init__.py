@@ -28,10 +28,10 @@ from handeye_tri.storage.folder import (
 from handeye_tri.storage.joint_files import read_joint_list, write_joint_list
 from handeye_tri.storage.pose_files import (
     POSES_SCHEMA,
-    PoseReader,
     read_moveit_samples,
     read_pose_pairs,
 )
+from handeye_tri.storage.pose_reader import PoseReader
 from handeye_tri.storage.structured import read_structured
 from handeye_tri.storage.trajectories import tum_text, write_tum
 

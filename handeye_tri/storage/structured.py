@@ -27,7 +27,10 @@ def read_structured(path: Path) -> Any:
 
     kind = "JSON" if path.suffix == ".json" else "YAML"
     try:
-        text = read_bytes(path).decode()
+        # Editors of some systems put a byte order mark first.
+        text = read_bytes(path).decode("utf-8-sig")
+        if not text.strip():
+            raise StorageError(f"{path}: this file is empty")
         if kind == "JSON":
             data = json.loads(text)
         else:

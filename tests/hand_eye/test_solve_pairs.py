@@ -137,14 +137,29 @@ def test_an_unknown_target_size_is_solved_for():
 def test_the_same_pose_over_and_over_is_refused():
     robot, observed, _, _ = scene(0, 1)
     many = [np.repeat(poses, 9, axis=0) for poses in (robot, observed)]
-    with pytest.raises(DegenerateMotionError, match="are the same"):
+    with pytest.raises(DegenerateMotionError, match="all 9 robot poses are the same"):
         solve_pose_pairs(pairs_of(*many))
+    robot, observed, _, _ = scene(0, 9)
+    observed[:] = observed[0]
+    with pytest.raises(DegenerateMotionError, match="9 observed poses are the same"):
+        solve_pose_pairs(pairs_of(robot, observed))
 
 
 @pytest.mark.parametrize(
     ("change", "keywords", "message"),
     [
         (lambda r, o: (r[:2], o[:2]), {}, "holds 2 motions; at least 3"),
+        (lambda r, o: (r[:1], o[:1]), {}, "holds 1 motion; at least 3.*record more"),
+        (
+            lambda r, o: (r, o * [[[1.2], [1.2], [1.2], [1]]]),
+            {},
+            "too far for rounding: check how it was written",
+        ),
+        (
+            lambda r, o: (r * [1, 1, -1, 1], o),
+            {},
+            "mirror image.*one axis has the wrong sign",
+        ),
         (
             lambda r, o: (r, o * [[[1.001], [1], [1], [1]]]),
             {},

@@ -206,6 +206,28 @@ MIRROR = np.diag([1.0, 1.0, -1.0]).tolist()
             ),
             "three letters",
         ),
+        (
+            put(
+                ["pairs", 0, "robot"],
+                {"translation_m": [0, 0, 1], "rotation_vector_rad": [0, 0, 90.0]},
+            ),
+            "turn by 90 rad.*rotation_vector_deg",
+        ),
+        (
+            put(["pairs", 0, "robot", "translation_m", 1], 1e200),
+            r"translation_m is 1e\+200 m away",
+        ),
+        (
+            put(
+                ["noise"],
+                dict.fromkeys(
+                    ["robot_translation_mm", "robot_rotation_deg", "lateral_mm"]
+                    + ["depth_mm", "rotation_deg"],
+                    -1.0,
+                ),
+            ),
+            "noise.robot_translation must not be negative",
+        ),
         (put(["noise"], {"lateral_mm": 1}), "\"noise\" lacks 'robot_translation_mm'"),
         (put(["pairs", 1], 7), r"pairs\[1\] must be an object, got 7"),
     ],
@@ -244,15 +266,27 @@ def test_rounded_rotations_are_taken_on_request(tmp_path):
     np.testing.assert_allclose(pairs.robot, ROBOT, atol=1e-4)
 
 
-@pytest.mark.parametrize("text", ["", "{", "\x00\x01", "[" * 100000])
+@pytest.mark.parametrize("text", ["", " \n", "\ufeff"])
+def test_an_empty_file_is_said(tmp_path, text):
+    with pytest.raises(StorageError, match="this file is empty"):
+        read_pose_pairs(write(tmp_path, text))
+
+
+def test_a_byte_order_mark_does_no_harm(tmp_path):
+    pairs = read_pose_pairs(write(tmp_path, "\ufeff" + json.dumps(content())))
+    assert len(pairs.names) == 5
+
+
+@pytest.mark.parametrize("text", ["{", "\x00\x01", "[" * 100000])
 def test_what_is_no_json_is_said(tmp_path, text):
     with pytest.raises(StorageError, match="not readable JSON"):
         read_pose_pairs(write(tmp_path, text))
 
 
 def test_a_list_and_a_missing_file_are_said(tmp_path):
-    with pytest.raises(InputError, match="--format moveit"):
-        read_pose_pairs(write(tmp_path, []))
+    for data in ([], 3, None):
+        with pytest.raises(InputError, match=r"no object.*--format moveit"):
+            read_pose_pairs(write(tmp_path, data))
     with pytest.raises(StorageError, match="missing"):
         read_pose_pairs(tmp_path / "absent.json")
 
