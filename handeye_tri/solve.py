@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri import arguments
 from handeye_tri.counting import counted
 from handeye_tri.diagnose import Verdict, assess_pose_pairs
-from handeye_tri.errors import ConvergenceError, InputError
+from handeye_tri.errors import ConvergenceError
 from handeye_tri.hand_eye import (
     PairMethod,
     PoseSolution,
@@ -76,12 +77,8 @@ def solve_and_judge(
         DegenerateMotionError: see there.
         ConvergenceError: see there.
     """
-    for name, limit in (
-        ("limit_position", limit_position),
-        ("limit_angle", limit_angle),
-    ):
-        if not 0 < limit < np.inf:
-            raise InputError(f"{name} must be positive, got {limit:g}")
+    arguments.positive("limit_position", limit_position)
+    arguments.positive("limit_angle", limit_angle)
     solution = solve_pose_pairs(
         pairs, method=method, shift_along_axis=shift_along_axis, seed=seed
     )

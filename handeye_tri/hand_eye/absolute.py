@@ -115,6 +115,11 @@ def _covariances(name: str, value: ArrayLike | None, n: int) -> Floats:
         )
     if not np.isfinite(covariance).all():
         raise InputError(f"{name} must be finite, got NaN or infinity")
+    least = np.linalg.eigvalsh(covariance).min()
+    if least < -1e-9 * np.abs(covariance).max():
+        raise InputError(
+            f"{name} must not be negative in any direction, got variance {least:.3g}"
+        )
     return np.broadcast_to(covariance, (n, 6, 6))
 
 

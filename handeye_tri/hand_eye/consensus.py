@@ -165,8 +165,10 @@ def scene_length(a: Floats) -> float:
     """
     positions = a[:, :3, 3]
     around = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
-    # A flange that turns on the spot still has an arm's length.
-    return float(max(np.median(around), 0.1 * np.linalg.norm(positions, axis=1).max()))
+    # A flange that turns on the spot still has an arm's length; where all is at the
+    # origin any length will do.
+    reach = 0.1 * np.linalg.norm(positions, axis=1).max()
+    return float(max(np.median(around), reach)) or 1.0
 
 
 def solve_samples(

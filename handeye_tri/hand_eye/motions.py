@@ -7,8 +7,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handeye_tri import arguments
 from handeye_tri.counting import counted
 from handeye_tri.errors import InputError
+from handeye_tri.records import numeric
 from handeye_tri.se3 import quaternion_wxyz, se3_inverse
 
 Floats = NDArray[np.float64]
@@ -71,7 +73,7 @@ def check_motions(name: str, motions: ArrayLike, least: int) -> Floats:
         InputError: wrong shape, too few, not finite, or not rigid; the message
             names the first bad index and says how far off it is.
     """
-    m = np.array(motions, dtype=float)
+    m = numeric(name, motions)
     if m.ndim != 3 or m.shape[1:] != (4, 4):
         raise InputError(f"{name} must have shape (n, 4, 4), got {m.shape}")
     if len(m) < least:
@@ -139,7 +141,7 @@ def check_pairs(a: ArrayLike, b: ArrayLike, least: int) -> tuple[Floats, Floats]
     Raises:
         InputError: a list is unusable, or their lengths differ.
     """
-    first, second = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    first, second = _numbers("a", a), _numbers("b", b)
     if first.shape == second.shape and first.shape[1:] == (4, 4):
         # Both at once, and only whether all is well: what is wrong is asked below.
         n = len(first)
@@ -155,6 +157,13 @@ def check_pairs(a: ArrayLike, b: ArrayLike, least: int) -> tuple[Floats, Floats]
             "a[i] and b[i] must belong together"
         )
     return first, second
+
+
+def _numbers(name: str, given: ArrayLike) -> Floats:
+    """Not copied where they are numbers already: a copy costs as much as a solver."""
+    if isinstance(given, np.ndarray) and given.dtype == np.float64:
+        return given
+    return numeric(name, given)
 
 
 def _all_rigid(motions: Floats) -> bool:
@@ -187,7 +196,12 @@ def relative_motions(
 
     Returns:
         Shape (number of pairs, 4, 4); pairs in lexical order.
+
+    Raises:
+        InputError: a word is not known, or poses are unusable.
     """
+    arguments.check_one_of("pairs", pairs, ("all", "successive"))
+    arguments.check_one_of("side", side, ("left", "right"))
     m = check_motions("poses", poses, 2)
     i, j = (
         np.triu_indices(len(m), 1)

@@ -56,8 +56,9 @@ def locked(
         for want, have in zip(shape, array.shape, strict=True)
     )
     if not fits:
-        wanted = tuple("any" if want is None else want for want in shape)
-        raise InputError(f"{name} must have shape {wanted}, got {array.shape}")
+        wanted = ", ".join("any" if want is None else str(want) for want in shape)
+        comma = "," if len(shape) == 1 else ""
+        raise InputError(f"{name} must have shape ({wanted}{comma}), got {array.shape}")
     if finite and not np.isfinite(array).all():
         raise InputError(f"{name} must be finite, got NaN or infinity")
     array.setflags(write=False)

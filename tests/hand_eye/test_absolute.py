@@ -212,6 +212,10 @@ def test_many_poses_are_no_special_case(method):
         ({"method": "refined", "covariance_a": np.eye(3)}, r"covariance_a.*\(6, 6\)"),
         ({"method": "refined", "covariance_b": np.full((6, 6), np.nan)}, "finite"),
         ({"method": "refined", "covariance_a": np.zeros((6, 6))}, "without noise"),
+        (
+            {"method": "refined", "covariance_a": -np.eye(6)},
+            "negative in any direction",
+        ),
     ],
 )
 def test_bad_keywords_are_named(keywords, message):

@@ -204,6 +204,9 @@ def test_poses_that_hardly_turn_are_refused():
         (lambda a, b: (a, b[:-1]), "a holds 4 motions and b 3"),
         (lambda a, b: (a[:1], b[:1]), "holds 1 motion; at least 2"),
         (lambda a, b: (a[0], b), r"shape \(n, 4, 4\)"),
+        (lambda a, b: ("poses", b), "a must be real numbers"),
+        (lambda a, b: ([a[0], a[1][:3]], b), "a must be .* in lists of equal length"),
+        (lambda a, b: (a, b + 1j), "b must be real numbers"),
         (lambda a, b: (a * [[[np.nan]], [[1]], [[1]], [[1]]], b), r"a\[0\] holds NaN"),
         (
             lambda a, b: (a, b * [[1.01], [1], [1], [1]]),
@@ -237,3 +240,10 @@ def test_two_half_turns_are_refused_however_well_they_fit():
         b = se3_inverse(x) @ a @ x @ se3_exp(sigma * rng.standard_normal((2, 6)))
         with pytest.raises(DegenerateMotionError):
             solve_axxb(a, b)
+
+
+@pytest.mark.parametrize("keyword", ["pairs", "side"])
+def test_an_unknown_word_is_refused(keyword):
+    poses = random_poses(np.random.default_rng(7), 3)
+    with pytest.raises(InputError, match=f"{keyword} must be one of .*got .both."):
+        relative_motions(poses, **{keyword: "both"})

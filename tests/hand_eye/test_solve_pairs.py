@@ -170,6 +170,11 @@ def test_the_same_pose_over_and_over_is_refused():
         (lambda r, o: (r, o), {"shift_along_axis": 0.1}, "leave 0 shifts open"),
         (
             lambda r, o: (r, o),
+            {"shift_along_axis": np.nan},
+            "must be a number, got nan",
+        ),
+        (
+            lambda r, o: (r, o),
             {"method": "shah", "shift_along_axis": 0.1},
             "without a stated shift",
         ),

@@ -23,7 +23,7 @@ def test_it_is_a_locked_copy_of_floats() -> None:
     ("value", "shape", "message"),
     [
         (np.zeros((2, 3)), (3, 2), r"grid must have shape \(3, 2\), got \(2, 3\)"),
-        (np.zeros(3), (None, 3), r"grid must have shape \('any', 3\), got \(3,\)"),
+        (np.zeros(3), (None, 3), r"grid must have shape \(any, 3\), got \(3,\)"),
         ([0.0, np.nan], (2,), "grid must be finite"),
         ([0.0, np.inf], (2,), "grid must be finite"),
     ],
