@@ -52,6 +52,7 @@ def programme(
     """
     from handeye_tri.pipeline import NullProgress, Run
     from handeye_tri.pipeline.programme import planned_outcome, write_programme
+    from handeye_tri.pipeline.tool_change import seconds_of_moves
     from handeye_tri.storage import SessionFolder
 
     cap_threads()
@@ -76,6 +77,7 @@ def programme(
     if written.change is not None:
         click.echo(
             f"{written.change}; the robot waits for it in its home after "
-            f"{written.change.before} of {len(written.stops)} stations"
+            f"{written.change.before} of {len(written.stops)} stations; "
+            f"{seconds_of_moves(written):.1f} s of moves"
         )
     click.echo(f"wrote {output}")

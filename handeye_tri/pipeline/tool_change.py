@@ -14,6 +14,7 @@ from handeye_tri.config import RigConfig
 from handeye_tri.errors import InputError
 from handeye_tri.exchange.robot_programme import Programme, ToolChange
 from handeye_tri.pipeline.run import Run
+from handeye_tri.plan.sequence import travel_time
 from handeye_tri.records import Floats
 
 # What may differ between the two cells: what they are called, the rig, what is planned.
@@ -93,6 +94,24 @@ def described(rig: RigConfig) -> str:
     return (
         f"half-turns about {turns}; AB {rig.side_ab_mm:g} mm, AC {rig.side_ac_mm:g} "
         f"mm, {rig.angle_deg:g} degrees at A"
+    )
+
+
+def seconds_of_moves(programme: Programme) -> float:
+    """Time of all moves, that to a tool change among them, without any standing."""
+    legs = []
+    for k in range(len(programme.stops)):
+        to_change = programme.way_to_change(k)
+        legs += (
+            [programme.leg(k)] if to_change is None else [to_change, programme.leg(k)]
+        )
+    return sum(
+        float(
+            travel_time(
+                leg[:-1], leg[1:], programme.speed, programme.acceleration_time
+            ).sum()
+        )
+        for leg in legs
     )
 
 

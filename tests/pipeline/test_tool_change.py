@@ -11,7 +11,8 @@ from handeye_tri import cli, storage
 from handeye_tri.errors import InputError
 from handeye_tri.pipeline import NullProgress, Run, execute, stages_of, start
 from handeye_tri.pipeline.programme import write_programme
-from handeye_tri.pipeline.tool_change import way_back
+from handeye_tri.pipeline.tool_change import seconds_of_moves, way_back
+from handeye_tri.plan.sequence import travel_time
 
 
 def planned(cell, folder):
@@ -44,6 +45,18 @@ def test_both_plans_are_driven_free_with_the_rig_that_is_mounted(runs, tmp_path)
     for run, way in zip(runs, ways, strict=True):
         for start_, end in pairwise(np.array(way)):
             assert run.arm.path_collision(start_, end) is None
+
+
+def test_the_time_of_the_moves_is_that_of_both_plans_and_the_way_between(
+    runs, tmp_path
+):
+    both = write_programme(runs[0], "json", tmp_path / "p", 1.0, then=runs[1])
+    way = both.way_to_change(both.change.before)
+    ramp = runs[0].cell.arm.acceleration_time_s
+    between = travel_time(way[:-1], way[1:], runs[0].arm.speed, ramp).sum()
+    planned_ = sum(run.plan().certificate["cycle_time_s"] for run in runs)
+    assert between > 0
+    assert seconds_of_moves(both) == pytest.approx(planned_ + between, rel=1e-12)
 
 
 def test_the_way_to_the_tool_change_goes_back_as_far_as_it_must(runs, tmp_path):
