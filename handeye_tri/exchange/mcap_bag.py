@@ -136,6 +136,7 @@ def session_mcap(bag: Bag) -> bytes:
     buffer = io.BytesIO()
     file = writer.Writer(buffer, enable_crcs=True)
     schemas: dict[str, Any] = {}
+    channels: dict[str, int] = file._channel_ids
 
     def write(topic: str, kind: str, time: int, message: dict[str, Any]) -> None:
         if kind not in schemas:
@@ -144,6 +145,15 @@ def session_mcap(bag: Bag) -> bytes:
                 f"{package}/msg/{name}", ros_version=2
             )
             schemas[kind] = file.register_msgdef(f"{package}/msg/{name}", definition)
+        if topic not in channels:
+            # Readers of a folder hold this against its metadata.yaml, as rosbag2 writes
+            # it; the encoder would register the channel without.
+            channels[topic] = file._writer.register_channel(
+                topic=topic,
+                message_encoding="cdr",
+                schema_id=schemas[kind].id,
+                metadata={"offered_qos_profiles": _quality_of_service(topic)},
+            )
         file.write_message(topic, schemas[kind], message, log_time=time)
 
     for message in _messages(bag):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import sys
+from collections import Counter
 
 import numpy as np
 import pinocchio as pin
@@ -225,6 +226,9 @@ def test_a_rosbag2_folder_holds_the_same_messages(bag, capsys, tmp_path):
         found = {c.topic: c.msgcount for c in reader.connections}
         assert found == {topic: len(rows) for topic, rows in topics.items()}
         assert reader.message_count == sum(found.values())
+        # Not only counted: a folder's connections must be those of its file.
+        read = Counter(connection.topic for connection, _, _ in reader.messages())
+        assert read == found
     information = yaml.safe_load((folder / "metadata.yaml").read_text())
     metadata = information["rosbag2_bagfile_information"]
     for row in metadata["topics_with_message_count"]:
