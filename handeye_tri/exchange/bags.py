@@ -21,12 +21,12 @@ from handeye_tri.exchange.bag_check import (
     check_mcap,
     refuse_compressed,
 )
+from handeye_tri.exchange.bag_images import decode_message
 from handeye_tri.exchange.capture import MAX_POSES, ImageStream, PoseStream
 from handeye_tri.exchange.mcap_bag import SESSION_TOPIC, import_ros
 from handeye_tri.exchange.tf_tree import Frames
 from handeye_tri.records import Floats, RobotDirection
 from handeye_tri.se3 import rotation_from_quaternion_wxyz, se3_inverse
-from handeye_tri.storage import decode_image
 
 _IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _JOINTS = "sensor_msgs/msg/JointState"
@@ -34,16 +34,6 @@ _TF = "tf2_msgs/msg/TFMessage"
 _POSE = "geometry_msgs/msg/PoseStamped"
 _TEXT = "std_msgs/msg/String"
 _KNOWN = (*_IMAGE, _JOINTS, _TF, _POSE, _TEXT)
-# Channels of the encodings that say all there is to know.
-_ENCODINGS = {
-    "mono8": (1, (0,)),
-    "8UC1": (1, (0,)),
-    "rgb8": (3, (0, 1, 2)),
-    "bgr8": (3, (2, 1, 0)),
-    "rgba8": (4, (0, 1, 2)),
-    "bgra8": (4, (2, 1, 0)),
-}
-_MAX_PIXELS = 100_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +203,9 @@ class BagFile:
             time, logged = taken[index]
             for _, _, message in self._logged([topic], at=logged):
                 if _stamp(message, logged) == time:
-                    return _decoded(message, f"{self.path}, {topic} at {time:.3f} s")
+                    return decode_message(
+                        message, f"{self.path}, {topic} at {time:.3f} s"
+                    )
             raise StorageError(f"{self.path}: {topic} has lost its message at {time} s")
 
         return ImageStream(tuple(time for time, _ in taken), read)
@@ -389,26 +381,3 @@ def _motion(translation: Any, rotation: Any, where: str) -> Floats:
     matrix[:3, :3] = rotation_from_quaternion_wxyz(q / np.linalg.norm(q))
     matrix[:3, 3] = t
     return matrix
-
-
-def _decoded(message: Any, where: str) -> NDArray[np.uint8]:
-    if hasattr(message, "format"):
-        return decode_image(bytes(message.data), where)
-    encoding = str(message.encoding)
-    if encoding not in _ENCODINGS:
-        raise InputError(
-            f"{where}: images of encoding {encoding!r} are not read; use one of "
-            f"{', '.join(_ENCODINGS)} or compressed ones"
-        )
-    channels, order = _ENCODINGS[encoding]
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    data = np.asarray(message.data, dtype=np.uint8)
-    fits = 0 < width * height <= _MAX_PIXELS and step >= width * channels
-    if not fits or data.size < step * height:
-        raise InputError(
-            f"{where}: {data.size} bytes are no image of {width} x {height} pixels "
-            f"({encoding}, {step} bytes a row)"
-        )
-    rows = data[: step * height].reshape(height, step)[:, : width * channels]
-    pixels = rows.reshape(height, width, channels)[..., list(order)]
-    return np.array(pixels[..., 0] if channels == 1 else pixels)
