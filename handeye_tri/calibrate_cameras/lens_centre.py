@@ -10,6 +10,10 @@ approximation, with the poses at their most likely (nested Laplace: Rue, Martino
 Chopin 2009, doi:10.1111/j.1467-9868.2008.00700.x). Mean and second moments of that
 are the estimate and its covariance. Where the centre is well known both are the linear
 ones.
+
+With the centre given, what remains curved is the trade of focal length against the
+highest radial coefficient. The mean would follow it away from the maximum and err more;
+so the maximum stays the estimate, and the covariance is the second moments about it.
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ from handeye_tri.calibrate_cameras.least_squares import (
     minimise,
 )
 from handeye_tri.calibrate_cameras.refine import HalfTurnModel, State
+from handeye_tri.camera import LENS_COEFFICIENTS
 
 Floats = NDArray[np.float64]
 
@@ -57,6 +62,14 @@ class Averaged:
     covariance: Floats
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Moments:
+    """Mean less the maximum, shape (g,), and covariance about the mean, (g, g)."""
+
+    mean: Floats
+    covariance: Floats
+
+
 def average_over_centre(
     model: HalfTurnModel, end: Minimum[State, Blocks], noise: float
 ) -> Averaged | None:
@@ -74,15 +87,67 @@ def average_over_centre(
     centre = [k for k, name in enumerate(model.choice.names) if name in CENTRE]
     if not centre or noise <= ROUNDING * model.rounding**2:
         return None
+    found = _moments(model, model.with_known(CENTRE), centre, end, noise)
+    equations = NormalEquations.of(end.blocks)
+    start = _moved(model, end.state, equations, found.mean)
+    known = model.with_known(model.choice.names).with_lens(())
+    best = minimise(known.evaluate, known.retract, start, model.rounding)
+    if best is None:
+        return None
+    return Averaged(best.state, best.cost, found.covariance)
+
+
+def covariance_about_maximum(
+    model: HalfTurnModel, end: Minimum[State, Blocks], noise: float
+) -> Floats | None:
+    """Second moments of the likelihood about its maximum, the centre being given.
+
+    Args:
+        model: Of the half-turns, with a lens and a known principal point.
+        end: The maximum of the likelihood.
+        noise: What chi2 is divided by: 1 for stated sigmas, else chi2 / dof.
+
+    Returns:
+        Of the shared unknowns, shape (g, g); None where rounding hides the
+        likelihood's shape.
+    """
+    if noise <= ROUNDING * model.rounding**2:
+        return None
+    size = len(end.state.lens)
+    names = next(one for one in LENS_COEFFICIENTS.values() if len(one) == size)
+    radial = [i for i in model.lens if names[i].startswith("k")]
+    if not radial:
+        return None
+    rest = tuple(i for i in model.lens if i != radial[-1])
+    place = len(model.choice.names) + model.lens.index(radial[-1])
+    found = _moments(model, model.with_lens(rest), [place], end, noise)
+    return found.covariance + np.outer(found.mean, found.mean)
+
+
+def _moments(
+    model: HalfTurnModel,
+    part: HalfTurnModel,
+    outer: list[int],
+    end: Minimum[State, Blocks],
+    noise: float,
+) -> _Moments:
+    """Moments of the likelihood, by quadrature over some shared unknowns.
+
+    Args:
+        model: Of the half-turns.
+        part: The same with those unknowns known.
+        outer: Their places among the shared unknowns.
+        end: The maximum of the likelihood.
+        noise: What chi2 is divided by.
+    """
     equations = NormalEquations.of(end.blocks)
     linear = noise * invert_information(equations.reduced())[0]
-    of_centre = linear[np.ix_(centre, centre)]
-    root = np.linalg.cholesky(of_centre)
-    # How the others follow a standard normal of the centre.
-    follow: Floats = linear[:, centre] @ np.linalg.inv(root).T
-    part = model.with_known(CENTRE)
-    rest = [k for k in range(len(linear)) if k not in centre]
-    units, gauss = centre_quadrature(len(centre))
+    of_outer = linear[np.ix_(outer, outer)]
+    root = np.linalg.cholesky(of_outer)
+    # How the others follow a standard normal of those.
+    follow: Floats = linear[:, outer] @ np.linalg.inv(root).T
+    rest = [k for k in range(len(linear)) if k not in outer]
+    units, gauss = centre_quadrature(len(outer))
     steps = np.zeros((len(units), len(linear)))
     covariances = np.zeros((len(units), *linear.shape))
     logarithms = np.full(len(units), -np.inf)
@@ -100,12 +165,7 @@ def average_over_centre(
         likely = unit @ unit - (found.cost - end.cost) / noise
         logarithms[node] = 0.5 * (likely + np.linalg.slogdet(given)[1])
     mean, covariance = mean_and_covariance(steps, covariances, gauss, logarithms)
-    start = _moved(model, end.state, equations, mean)
-    known = model.with_known(model.choice.names).with_lens(())
-    best = minimise(known.evaluate, known.retract, start, model.rounding)
-    if best is None:
-        return None
-    return Averaged(best.state, best.cost, covariance)
+    return _Moments(mean, covariance)
 
 
 def centre_quadrature(dimensions: int) -> tuple[Floats, Floats]:

@@ -113,7 +113,8 @@ def calibrate_camera(
             aspect ratio, one half-turn is enough.
         distortion: Lens coefficients to estimate: all of a model, or their names. With
             the principal point estimated too, camera and covariance are mean and
-            second moments of the likelihood (:mod:`lens_centre`), not its maximum.
+            second moments of the likelihood (:mod:`lens_centre`), not its maximum;
+            with it given, the maximum and the second moments about that.
         refine: False stops at the closed form.
         method: Closed form by the paper's rows, or by whitened homographies, which
             are about twice as accurate and near the Cramer-Rao bound. With ``refine``

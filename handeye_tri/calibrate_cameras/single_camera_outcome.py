@@ -18,7 +18,11 @@ from handeye_tri.calibrate_cameras.degeneracy import (
 )
 from handeye_tri.calibrate_cameras.homography import Homographies
 from handeye_tri.calibrate_cameras.least_squares import NormalEquations
-from handeye_tri.calibrate_cameras.lens_centre import average_over_centre
+from handeye_tri.calibrate_cameras.lens_centre import (
+    CENTRE,
+    average_over_centre,
+    covariance_about_maximum,
+)
 from handeye_tri.calibrate_cameras.refine import (
     HalfTurnModel,
     State,
@@ -162,9 +166,13 @@ def refined(
     closed_cost = None if closed is None else model.evaluate(closed)
     scale = 1.0 if noise_known else noise
     covariance, chi2 = covariance * scale, end.cost
-    averaged = average_over_centre(model, end, scale) if model.lens else None
-    if averaged is not None:
-        state, chi2, covariance = averaged.state, averaged.cost, averaged.covariance
+    if model.lens and set(CENTRE) & set(model.choice.names):
+        averaged = average_over_centre(model, end, scale)
+        if averaged is not None:
+            state, chi2, covariance = averaged.state, averaged.cost, averaged.covariance
+    elif model.lens:
+        about = covariance_about_maximum(model, end, scale)
+        covariance = covariance if about is None else about
     count = model.camera_unknowns
     return Outcome(
         state,

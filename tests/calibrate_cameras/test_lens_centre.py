@@ -15,6 +15,7 @@ from handeye_tri.calibrate_cameras.lens_centre import (
 )
 from handeye_tri.calibrate_cameras.trials import calibrate_trials
 from handeye_tri.camera import Lens
+from handeye_tri.triangle import TriangleRig
 
 COEFFICIENTS = np.array([-0.21, 0.13, 1e-3, -6e-4, 0.0])
 NAMES = ("k1", "k2", "p1", "p2")
@@ -105,6 +106,39 @@ def test_a_well_known_centre_leaves_maximum_and_linear_covariance() -> None:
     assert np.abs(np.array(off) / std).max() < 0.02
     difference = stated.covariance.matrix - 1e4 * finer.covariance.matrix
     assert np.abs(difference / np.outer(std, std)).max() < 1e-3
+
+
+@pytest.mark.parametrize("names", [("k1", "k2"), NAMES])
+def test_nees_is_one_where_k2_is_not_determined(names: Any) -> None:
+    kept = np.isin(("k1", "k2", "p1", "p2", "k3"), names)
+    scene = make_scene(
+        np.random.default_rng(2),
+        11,
+        "AB",
+        triangle=TriangleRig(0.13, 0.12, np.radians(60.0)),
+        view=camera(lens=Lens("radtan", COEFFICIENTS * kept)),
+        sideways=0.25,
+    )
+    wanted = ("fx", "fy", "skew", *names)
+    truth = np.array([scene.camera.parameter(name) for name in wanted])
+    nees = []
+    for trial in range(120):
+        found = calibrate_camera(
+            *scene.noisy(np.random.default_rng([7, trial]), 1.0),
+            scene.triangle,
+            image_size=IMAGE_SIZE,
+            axis="AB",
+            distortion=names,
+            fixed={"cx": 519.3, "cy": 377.8},
+            sigma_px=1.0,
+        )
+        assert found.covariance.labels == tuple(f"camera.{name}" for name in wanted)
+        error = np.array([found.camera.parameter(name) for name in wanted]) - truth
+        covariance = found.covariance.matrix
+        nees.append(error @ np.linalg.solve(covariance, error) / len(error))
+    # Of 120 chi-square variables with 5 or 7 degrees of freedom: 1 +- 0.06; the
+    # covariance of the linear problem has 1.2.
+    assert 0.82 < np.mean(nees) < 1.18
 
 
 def test_a_known_principal_point_is_not_averaged_over() -> None:
