@@ -283,6 +283,8 @@ def table(folders: list[Path], tracks: list[str] | None) -> bool:
                 for k in (0, 1)
             )
         )
+    if not shares:
+        return False
     overall = np.exp(np.mean(np.log(shares), axis=0))
     print(
         f"overall (geometric mean of ratios): {overall[0]:.3f} rotation, "
