@@ -40,11 +40,15 @@ def check_other_rig(run: Run, then: Run) -> None:
             )
     if storage.sha256(run.model_path) != storage.sha256(then.model_path):
         raise InputError(f"{where}: the arm's model files differ; plan both with one")
-    if first["rig"] == second["rig"] or first["name"] == second["name"]:
-        same = "rig" if first["rig"] == second["rig"] else "name"
+    if first["rig"] == second["rig"]:
         raise InputError(
-            f"{where}: both cells have the {same} {first[same]}; a tool change goes to "
-            "another rig, in a cell of another name"
+            f"{where}: both cells have the same rig, so there is no tool to change; "
+            "name a session of a cell with another rig"
+        )
+    if first["name"] == second["name"]:
+        raise InputError(
+            f"{where}: both cells are called {first['name']}, and a person could not "
+            "tell which rig to mount; give one of them another name"
         )
 
 

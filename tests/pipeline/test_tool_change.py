@@ -86,7 +86,7 @@ def test_a_list_of_stations_cannot_state_a_tool_change(runs, tmp_path):
 
 
 def test_the_same_rig_is_no_tool_change(runs, tmp_path):
-    with pytest.raises(InputError, match="both cells have the rig"):
+    with pytest.raises(InputError, match="both cells have the same rig"):
         write_programme(runs[0], "json", tmp_path / "p", 1.0, then=runs[0])
 
 
@@ -98,6 +98,15 @@ def test_cells_may_differ_in_their_rig_only(runs, tmp_path):
     other.write_text(text)
     run = Run(start(str(other), tmp_path / "out", 1, 3), NullProgress())
     with pytest.raises(InputError, match="but cameras differs"):
+        write_programme(runs[0], "json", tmp_path / "p", 1.0, then=run)
+
+
+def test_the_two_rigs_are_told_apart_by_name(runs, tmp_path):
+    text = storage.find_cell("hp3_stereo_edge").read_text()
+    other = tmp_path / "other.yaml"
+    other.write_text(text.replace("name: hp3_stereo_edge", "name: hp3_stereo"))
+    run = Run(start(str(other), tmp_path / "out", 1, 3), NullProgress())
+    with pytest.raises(InputError, match="both cells are called hp3_stereo, and"):
         write_programme(runs[0], "json", tmp_path / "p", 1.0, then=run)
 
 
