@@ -30,7 +30,6 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import joblib
@@ -72,7 +71,6 @@ class Outcome:
     refused: str = ""
 
 
-@cache
 def scene(name: str, model: Path) -> tuple[Cell, Arm]:
     cell = read_cell(REPO / "scenes" / f"{CELLS.get(name, name)}.yaml")
     return cell, Arm(compile_mechanism(cell, model))
@@ -106,10 +104,13 @@ def solutions_of(cell: Cell, arm: Arm, plan: Plan) -> list[NDArray[np.float64]]:
     poses = np.array([station.base_from_flange.matrix for station in plan.stations])
     seen = view.seen(arm.base_from_world.inverse().matrix @ poses)
     found = []
-    for pose, by, joints in zip(
-        poses, seen, arm.inverse(poses, rng).joints, strict=True
-    ):
-        free = search.free(Prospect(pose[None], by, joints[:, None]), len(joints))
+    solved = arm.inverse(poses, rng).joints
+    for k, station in enumerate(plan.stations):
+        # Near its limits an arm of seven joints may be hard to solve anew.
+        joints = solved[k] if len(solved[k]) else station.joints[None]
+        free = search.free(
+            Prospect(poses[k, None], seen[k], joints[:, None]), len(joints)
+        )
         found.append(np.array([candidate.joints[0] for candidate in free]))
     return found
 
