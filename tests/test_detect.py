@@ -189,6 +189,26 @@ def test_the_covariance_of_a_rendered_staircase(noise: float, blur: float) -> No
     assert 0.65 < squares.mean() < 1.4
 
 
+@pytest.mark.parametrize("shown", [0.45, 0.6, 0.75])
+def test_a_cap_of_a_ball_is_not_a_smaller_ball(shown: float) -> None:
+    """A slanted bar hides the lower part: found where it is, or not at all."""
+    for seed in range(6):
+        rng = np.random.default_rng([18, seed])
+        canvas = Canvas(160, 120, 60)
+        centre = np.array([80.0, 60.0]) + rng.uniform(-0.5, 0.5, 2)
+        canvas.disc((0, 0, 255), centre, 15.0, fine=8)
+        slope, level = rng.uniform(-0.3, 0.3), rng.uniform(120, 200)
+        top = centre[1] + 15.0 * (2 * shown - 1)
+
+        def below(x: Floats, y: Floats) -> NDArray[np.bool_]:
+            return y > top + slope * (x - centre[0])  # noqa: B023
+
+        canvas.paint((level,) * 3, (40.0, 30.0, 120.0, 100.0), below, 8)
+        found = detect_markers(canvas.image(rng), BY_COLOUR)
+        off = np.linalg.norm(found.pixels[2] - centre)
+        assert not off > 0.5
+
+
 def test_noise_of_the_background_is_in_the_covariance() -> None:
     """What it moves together counts more for the centre than for a finer wave."""
     rng = np.random.default_rng(17)

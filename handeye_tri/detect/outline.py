@@ -134,11 +134,12 @@ def measure(
         ellipses[good] = fit.ellipses
         gain[good], scatter[good] = fit.gain, fit.scatter
         edges[good] = fit.edges
+        beyond = _goes_on(sampler, good, fit.ellipses, levels[good])
         for k, spot in enumerate(good):
             if (
                 fit.usable[k] < _MIN_USABLE
                 or fit.hidden[k] > _MAX_HIDDEN
-                or fit.astray[k] > _MAX_ASTRAY
+                or fit.astray[k] + beyond[k] > _MAX_ASTRAY
             ):
                 reasons[spot] = "occluded"
             elif not fit.misfit[k] < max(_MAX_MISFIT, 0.01 * fit.ellipses[k, 2]):
@@ -273,6 +274,36 @@ def _ovals(edges: Floats, seen: Flags) -> tuple[Floats, Flags]:
     return np.asarray(coefficients), kept
 
 
+def _ring(
+    sampler: Sampler, spots: Indices, ellipses: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Levels just behind the edge in each direction, (m, rays, 3).
+
+    Returns:
+        The levels; how far behind the edge, (m, 3), px; the edge's blur, (m, 1), px.
+    """
+    # Sampling between pixels blurs the edge a little more.
+    blur = np.sqrt(ellipses[:, 5] ** 2 + SAMPLING_VARIANCE)[:, None]
+    distance = RING_START * blur + _RING
+    radii = radii_by_direction(ellipses)[..., None] + distance[:, None]
+    points = ellipses[:, None, None, :2] + radii[..., None] * _DIRECTIONS[:, None]
+    return sampler(spots, points), distance, blur
+
+
+def _goes_on(
+    sampler: Sampler, spots: Indices, ellipses: Floats, levels: Floats
+) -> Floats:
+    """Part of the directions in which the marker's level goes on behind the edge, (m,).
+
+    There the outline is none: the fit leaves those directions out, and would not see
+    that the ellipse lies within the marker.
+    """
+    behind = _ring(sampler, spots, ellipses)[0].mean(axis=2)
+    usual = np.median(behind, axis=1, keepdims=True)
+    inside = levels[:, None]
+    return np.asarray((np.abs(behind - inside) < np.abs(behind - usual)).mean(axis=1))
+
+
 def _background(
     sampler: Sampler, spots: Indices, ellipses: Floats, levels: Floats, noise: Floats
 ) -> tuple[Floats, Floats]:
@@ -282,12 +313,7 @@ def _background(
         Levels (m, rays); weights 0-1 (m, rays), 0 where the background is uneven or
         too like the marker.
     """
-    # Sampling between pixels blurs the edge a little more.
-    blur = np.sqrt(ellipses[:, 5] ** 2 + SAMPLING_VARIANCE)[:, None]
-    distance = RING_START * blur + _RING
-    radii = radii_by_direction(ellipses)[..., None] + distance[:, None]
-    points = ellipses[:, None, None, :2] + radii[..., None] * _DIRECTIONS[:, None]
-    values = sampler(spots, points)
+    values, distance, blur = _ring(sampler, spots, ellipses)
     # The edge's foot still covers a little of these places.
     foot = ndtr(-distance / blur)[:, None]
     values = (values - foot * levels[:, None, None]) / (1 - foot)
