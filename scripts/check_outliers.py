@@ -4,8 +4,8 @@ Four of twenty half-turns bad: root mean square errors of (fx, fy, skew, cx, cy)
 those of the sixteen good ones alone; bad ones kept, bad ones dropped for a reason that
 is not theirs, good ones dropped, failed runs. Exits with 1 where a ratio is above 1.2,
 a run failed, more than one in fifty bad ones is kept (a turn of 170 degrees about an
-edge can look like one of 180 to within the noise), or good half-turns are dropped: more
-than one, and one in a thousand.
+edge can misfit by less than what drops hardly any good one), or good half-turns are
+dropped: more than one, and one in a thousand.
 
     python scripts/check_outliers.py [--trials 50] [--healthy 200]
 """
