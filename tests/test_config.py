@@ -359,3 +359,46 @@ def test_a_measured_cell_states_what_counts_and_no_more(path, value, message):
 def test_a_measured_cell_cannot_be_planned_or_simulated():
     with pytest.raises(InputError, match="neither planned nor simulated"):
         parse_cell(MEASURED, "bench.yaml")
+
+
+SECOND = {"axis": "BC", "ahead_mm": 80}
+
+
+def test_a_second_mount_holds_the_same_triangle_otherwise(cell: Description) -> None:
+    parsed = parse_cell(cell | {"second_mount": SECOND}, "cell.yaml")
+    first, second = parsed.mounted
+    assert first.rig == parsed.rig
+    assert second.rig.triangle == first.rig.triangle
+    assert second.rig.marker_radii_mm == first.rig.marker_radii_mm
+    # The edge BC lies on the flange's z axis, B 80 mm from the flange.
+    markers = second.rig.flange_from_triangle.apply(second.rig.triangle.points)
+    assert markers[1] == pytest.approx([0, 0, 0.08], abs=1e-12)
+    assert markers[2, :2] == pytest.approx([0, 0], abs=1e-12)
+    assert first.second_mount is None
+    assert second.second_mount is None
+    assert parsed.axes == ("normal", "BC")
+    assert Cell.model_validate(parsed.model_dump(by_alias=True)) == parsed
+
+
+def test_a_cell_without_a_second_mount_is_its_own_first(cell: Description) -> None:
+    parsed = parse_cell(cell, "cell.yaml")
+    assert parsed.mounted == (parsed,)
+    assert parsed.axes == ("normal",)
+
+
+def test_mounts_that_do_not_differ_are_refused(cell: Description) -> None:
+    same = {"axis": "normal", "ahead_mm": 90}
+    with pytest.raises(InputError, match="no tool to change"):
+        parse_cell(cell | {"second_mount": same}, "cell.yaml")
+
+
+def test_the_holder_of_a_second_mount_must_fit_its_axis(cell: Description) -> None:
+    with pytest.raises(InputError, match="holder: hands does not hold an axis BC"):
+        parse_cell(cell | {"second_mount": SECOND | {"holder": "hands"}}, "cell.yaml")
+
+
+def test_a_measured_cell_states_the_axis_of_its_second_mount_only():
+    measured = parse_any_cell(MEASURED | {"second_mount": {"axis": "CA"}}, "bench.yaml")
+    assert measured.axes == ("normal", "CA")
+    with pytest.raises(InputError, match=r"second_mount\.ahead_mm: this key is not"):
+        parse_any_cell(MEASURED | {"second_mount": SECOND}, "bench.yaml")

@@ -5,16 +5,16 @@ from handeye_tri.config.cell import (
     CellToCalibrate,
     ImagingConfig,
     MeasuredCell,
-    RigConfig,
-    TriangleConfig,
 )
 from handeye_tri.config.parse import parse_any_cell, parse_cell
+from handeye_tri.config.rig import MountConfig, RigConfig, TriangleConfig
 
 __all__ = [
     "Cell",
     "CellToCalibrate",
     "ImagingConfig",
     "MeasuredCell",
+    "MountConfig",
     "RigConfig",
     "TriangleConfig",
     "parse_any_cell",

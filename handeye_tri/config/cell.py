@@ -5,29 +5,25 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from handeye_tri.camera import LENS_COEFFICIENTS, Intrinsics, Lens, PinholeCamera
-from handeye_tri.errors import InputError
+from handeye_tri.config.fields import (
+    Count,
+    Model,
+    NotNegative,
+    Number,
+    Point,
+    Positive,
+    Switch,
+)
+from handeye_tri.config.rig import MountConfig, RigConfig, SecondAxis, TriangleConfig
 from handeye_tri.records import CameraInfo, Repeatability
 from handeye_tri.se3 import SE3, so3_exp
-from handeye_tri.triangle import Axis, TriangleRig
-
-# Strict: neither "0.03" nor true is a number.
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[Number, Field(gt=0)]
-NotNegative = Annotated[Number, Field(ge=0)]
-Unit = Annotated[Number, Field(ge=0, le=1)]
-Count = Annotated[int, Field(strict=True, ge=1)]
-Switch = Annotated[bool, Field(strict=True)]
-Point = tuple[Number, Number, Number]
+from handeye_tri.triangle import Axis
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class RobotAccuracy(_Model):
+class RobotAccuracy(Model):
     """What is to be known of any robot: one standard deviation per axis."""
 
     repeatability_mm: NotNegative
@@ -50,113 +46,7 @@ class ArmConfig(RobotAccuracy):
     )
 
 
-class TriangleConfig(_Model):
-    """The triangle, the axis it turns about, and how its markers look."""
-
-    axis: Axis
-    side_ab_mm: Positive
-    side_ac_mm: Positive
-    angle_deg: Annotated[Number, Field(gt=0, lt=180)]
-    marker_radii_mm: tuple[Positive, Positive, Positive]
-    marker_colours: tuple[tuple[Unit, Unit, Unit], ...] = Field(
-        min_length=3, max_length=3, description="A, B, C as red green blue, 0-1"
-    )
-    identity: Literal["colour", "radius"]
-
-    @model_validator(mode="after")
-    def _distinguishable(self) -> TriangleConfig:
-        try:
-            _ = self.triangle
-        except InputError as error:
-            raise ValueError(str(error)) from None
-        if self.identity == "colour" and len(set(self.marker_colours)) < 3:
-            raise ValueError(
-                "identity: colour needs three different marker_colours; "
-                "use three colours, or identity: radius"
-            )
-        triangle, balls = self.triangle, self.marker_radii_mm
-        sides = 1e3 * np.array([triangle.side_ab, triangle.side_bc, triangle.side_ac])
-        if (sides <= np.add(balls, np.roll(balls, -1))).any():
-            raise ValueError(
-                f"markers of marker_radii_mm {list(balls)} touch each other at "
-                f"sides of {', '.join(f'{side:.1f}' for side in sides)} mm; "
-                "make the markers smaller or the triangle larger"
-            )
-        radii = sorted(self.marker_radii_mm)
-        if self.identity == "radius" and min(np.diff(radii)) < 0.1 * radii[0]:
-            raise ValueError(
-                "identity: radius needs marker_radii_mm at least 10 % apart, "
-                f"got {list(self.marker_radii_mm)}"
-            )
-        return self
-
-    @property
-    def triangle(self) -> TriangleRig:
-        """The rig in metres and radians."""
-        return TriangleRig(
-            1e-3 * self.side_ab_mm,
-            1e-3 * self.side_ac_mm,
-            float(np.radians(self.angle_deg)),
-        )
-
-
-class RigConfig(TriangleConfig):
-    """The triangle on the flange, as built.
-
-    The flange's z axis is the half-turn axis. "normal": it meets the triangle's
-    plane in O, by default the circumcentre. An edge: the edge lies on it, its first
-    vertex ``ahead_mm`` from the flange.
-    """
-
-    ahead_mm: Positive
-    turn_deg: Number = 0.0
-    o_mm: tuple[Number, Number] | None = Field(
-        None, description="O from A, along AB and across it; a normal axis only"
-    )
-    holder: Literal["rods", "hands", "board"] = Field(
-        "rods",
-        description="rods; a clock's hands (normal axis); a board (an edge)",
-    )
-
-    @model_validator(mode="after")
-    def _held(self) -> RigConfig:
-        if self.o_mm is not None and self.axis != "normal":
-            raise ValueError(
-                "o_mm says where a normal axis meets the plane, but axis is "
-                f"{self.axis}; leave o_mm out, or use axis: normal"
-            )
-        fits = {"hands": self.axis == "normal", "board": self.axis != "normal"}
-        if not fits.get(self.holder, True):
-            raise ValueError(
-                f"holder: {self.holder} does not hold an axis {self.axis}: a clock's "
-                "hands turn about a normal, a board about an edge; use holder: rods"
-            )
-        return self
-
-    @property
-    def flange_from_triangle(self) -> SE3:
-        """Where the triangle's frame sits on the flange, as built."""
-        triangle = self.triangle
-        ahead = np.array([0.0, 0.0, 1e-3 * self.ahead_mm])
-        spin = so3_exp([0.0, 0.0, np.radians(self.turn_deg)])
-        if self.axis == "normal":
-            # The triangle looks ahead, away from the flange.
-            foot = triangle.circumcentre
-            if self.o_mm is not None:
-                foot = 1e-3 * np.array(self.o_mm)
-            o = np.append(foot, 0.0)
-            return SE3.from_parts(spin, ahead - spin @ o)
-        start = {"AB": 0, "BC": 1, "CA": 2}[self.axis]
-        points = triangle.points
-        along = points[(start + 1) % 3] - points[start]
-        along /= np.linalg.norm(along)
-        normal = np.array([0.0, 0.0, 1.0])
-        # Rows: flange axes in the triangle's frame; z along the edge, y the normal.
-        rotation = spin @ np.array([np.cross(normal, along), normal, along])
-        return SE3.from_parts(rotation, ahead - rotation @ points[start])
-
-
-class LensConfig(_Model):
+class LensConfig(Model):
     """Distortion of a simulated camera, by name of the coefficient."""
 
     model: Literal["radtan", "rational"] = "radtan"
@@ -181,7 +71,7 @@ class LensConfig(_Model):
         )
 
 
-class EstimateConfig(_Model):
+class EstimateConfig(Model):
     """What is to be estimated of a camera."""
 
     skew: Switch = True
@@ -200,7 +90,7 @@ class EstimateConfig(_Model):
         return self
 
 
-class CameraToCalibrate(_Model):
+class CameraToCalibrate(Model):
     """What is to be known of any camera, and what is estimated of it."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -264,7 +154,7 @@ class CameraConfig(CameraToCalibrate):
         return SE3.from_parts(np.stack([right, down, forward], axis=1) @ roll, position)
 
 
-class ImagingConfig(_Model):
+class ImagingConfig(Model):
     """From the ideal picture to the file."""
 
     supersample: Annotated[Count, Field(le=4)] = 2
@@ -273,7 +163,7 @@ class ImagingConfig(_Model):
     grey: Switch = False
 
 
-class BoxConfig(_Model):
+class BoxConfig(Model):
     """Something that stands in the cell."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -281,7 +171,7 @@ class BoxConfig(_Model):
     position_m: Point
 
 
-class MotionConfig(_Model):
+class MotionConfig(Model):
     """What any robot's motions must satisfy."""
 
     min_plane_spread_deg: Annotated[Number, Field(gt=0, le=60)] = 20.0
@@ -311,12 +201,15 @@ class PlanConfig(MotionConfig):
         return self
 
 
-class CellToCalibrate(_Model):
+class CellToCalibrate(Model):
     """What calibration needs to know of a cell, simulated or real."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
     arm: RobotAccuracy
     rig: TriangleConfig
+    second_mount: SecondAxis | None = Field(
+        None, description="how the same triangle is held after a tool change"
+    )
     cameras: tuple[CameraToCalibrate, ...] = Field(min_length=1)
     plan: MotionConfig = MotionConfig()
     track_limit_mm: Positive = 1.0
@@ -327,6 +220,12 @@ class CellToCalibrate(_Model):
         if len(set(names)) < len(names):
             raise ValueError(f"camera names must differ, got {names}")
         return self
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """The half-turn axis of each mount."""
+        second = () if self.second_mount is None else (self.second_mount.axis,)
+        return (self.rig.axis, *second)
 
     @property
     def repeatability(self) -> Repeatability:
@@ -349,6 +248,9 @@ class Cell(CellToCalibrate):
     schema_: Literal["handeye_tri.cell/1"] = Field(alias="schema")
     arm: ArmConfig
     rig: RigConfig
+    second_mount: MountConfig | None = Field(
+        None, description="how the same triangle is held after a tool change"
+    )
     cameras: tuple[CameraConfig, ...] = Field(min_length=1)
     imaging: ImagingConfig = ImagingConfig()
     surroundings: tuple[BoxConfig, ...] = ()
@@ -360,3 +262,22 @@ class Cell(CellToCalibrate):
         if len(set(boxes)) < len(boxes):
             raise ValueError(f"names of surroundings must differ, got {boxes}")
         return self
+
+    @model_validator(mode="after")
+    def _mounts_differ(self) -> Cell:
+        if self.second_mount is not None and self.mounted[0].rig == self.mounted[1].rig:
+            raise ValueError(
+                "second_mount holds the triangle as rig does, so there is no tool to "
+                "change; give it another axis, ahead_mm, turn_deg, o_mm or holder, or "
+                "leave it out"
+            )
+        return self
+
+    @property
+    def mounted(self) -> tuple[Cell, ...]:
+        """The cell with each mount, in order, as the rig of a cell without another."""
+        if self.second_mount is None:
+            return (self,)
+        rig = self.rig.model_copy(update=self.second_mount.model_dump())
+        alone = self.model_copy(update={"second_mount": None})
+        return alone, alone.model_copy(update={"rig": rig})

@@ -18,8 +18,8 @@ from handeye_tri.config.cell import (
     LensConfig,
     MeasuredCell,
     PlanConfig,
-    RigConfig,
 )
+from handeye_tri.config.rig import MountConfig, RigConfig
 from handeye_tri.errors import InputError
 
 if TYPE_CHECKING:
@@ -69,6 +69,7 @@ def _validated(kind: type[_Kind], data: Mapping[str, object], source: str) -> _K
 _SECTIONS: dict[str, type[BaseModel]] = {
     "arm": ArmConfig,
     "rig": RigConfig,
+    "second_mount": MountConfig,
     "cameras": CameraConfig,
     "lens": LensConfig,
     "estimate": EstimateConfig,

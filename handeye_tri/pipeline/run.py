@@ -257,18 +257,31 @@ class Run:
         return Path(self.folder.header["model_file"])
 
     @cached_property
-    def mechanism(self) -> Mechanism:
-        """The compiled cell."""
+    def mechanisms(self) -> tuple[Mechanism, ...]:
+        """The compiled cell with each mount."""
         from handeye_tri.simulate import compile_mechanism
 
-        return compile_mechanism(self.designed_cell, self.model_path)
+        return tuple(
+            compile_mechanism(cell, self.model_path)
+            for cell in self.designed_cell.mounted
+        )
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """The compiled cell with its first mount."""
+        return self.mechanisms[0]
 
     @cached_property
-    def arm(self) -> Arm:
-        """Kinematics and collisions of the compiled cell."""
+    def arms(self) -> tuple[Arm, ...]:
+        """Kinematics and collisions of the compiled cell with each mount."""
         from handeye_tri.arm import Arm
 
-        return Arm(self.mechanism)
+        return tuple(Arm(mechanism) for mechanism in self.mechanisms)
+
+    @property
+    def arm(self) -> Arm:
+        """Kinematics of the compiled cell, and collisions with its first mount."""
+        return self.arms[0]
 
     def plan(self) -> Plan:
         """The programme, read back."""

@@ -9,7 +9,9 @@ from handeye_tri.records.covariance import (
     MARKER_LABELS,
     MOTION_QUANTITIES,
     Covariance,
+    marker_labels,
     motion_labels,
+    triangle_name,
 )
 from handeye_tri.records.pose_pairs import (
     Mounting,
@@ -22,6 +24,7 @@ from handeye_tri.records.results import (
     CameraCalibration,
     GroundTruth,
     HandEyeCalibration,
+    Mount,
     TrackEvaluation,
 )
 from handeye_tri.records.session import (
@@ -33,6 +36,7 @@ from handeye_tri.records.session import (
     Session,
     Station,
     StationKind,
+    ToolChange,
 )
 
 __all__ = [
@@ -42,7 +46,9 @@ __all__ = [
     "MARKER_LABELS",
     "MOTION_QUANTITIES",
     "Covariance",
+    "marker_labels",
     "motion_labels",
+    "triangle_name",
     "Mounting",
     "ObservedDirection",
     "PoseNoise",
@@ -51,6 +57,7 @@ __all__ = [
     "CameraCalibration",
     "GroundTruth",
     "HandEyeCalibration",
+    "Mount",
     "TrackEvaluation",
     "CameraInfo",
     "DroppedHalfTurn",
@@ -60,4 +67,5 @@ __all__ = [
     "Session",
     "Station",
     "StationKind",
+    "ToolChange",
 ]

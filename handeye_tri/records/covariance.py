@@ -82,5 +82,24 @@ def motion_labels(name: str) -> tuple[str, ...]:
     return tuple(f"{name}.{quantity}" for quantity in MOTION_QUANTITIES)
 
 
-# A, B, C in the flange frame, metres; the error is estimate less truth.
-MARKER_LABELS = tuple(f"marker_{k}.{axis}" for k in VERTICES for axis in "xyz")
+def _suffix(mount: int) -> str:
+    """What names a mount; the first, mostly the only one, goes without."""
+    return f"_{mount + 1}" if mount else ""
+
+
+def triangle_name(mount: int = 0) -> str:
+    """Name of the motion that says how a mount, from 0, holds the triangle."""
+    return f"flange_from_triangle{_suffix(mount)}"
+
+
+def marker_labels(mount: int = 0) -> tuple[str, ...]:
+    """Labels of A, B, C in the flange frame, metres, on a mount, from 0.
+
+    The error is estimate less truth.
+    """
+    return tuple(
+        f"marker_{k}{_suffix(mount)}.{axis}" for k in VERTICES for axis in "xyz"
+    )
+
+
+MARKER_LABELS = marker_labels()

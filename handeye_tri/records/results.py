@@ -70,6 +70,23 @@ class CameraCalibration:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Mount:
+    """How the rig sits on the flange.
+
+    Attributes:
+        flange_from_triangle: Where the triangle's frame is.
+        markers: A, B, C in the flange frame, shape (3, 3), metres.
+    """
+
+    flange_from_triangle: SE3
+    markers: Floats
+
+    def __post_init__(self) -> None:
+        """Lock the markers."""
+        object.__setattr__(self, "markers", locked("markers", self.markers, (3, 3)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class HandEyeCalibration:
     """The whole cell: cameras in the robot base, the rig on the flange.
 
@@ -80,7 +97,8 @@ class HandEyeCalibration:
         markers: A, B, C in the flange frame, shape (3, 3), metres.
         covariance: Labels as in CameraCalibration, and "base_from_<camera>.x" ...,
             "flange_from_triangle.x" ...; where the markers are estimated,
-            "marker_A.x" ... in the flange frame (m), and those of ``robot``.
+            "marker_A.x" ... in the flange frame (m), those of a second mount as
+            "flange_from_triangle_2.x" and "marker_A_2.x", and those of ``robot``.
         chi2: Sum of squared whitened residuals of the hand-eye step.
         dof: Its degrees of freedom.
         residuals: One tangent per calibration station, shape (n, 6), m and rad:
@@ -90,6 +108,7 @@ class HandEyeCalibration:
         robot: Systematic errors of the robot that were estimated, by label (m, rad,
             s): true poses are the reported ones with these applied.
         details: Numbers that a method adds, by name.
+        other_mounts: How the rig sits after a tool change; mostly there is none.
     """
 
     cameras: tuple[PinholeCamera, ...]
@@ -104,6 +123,7 @@ class HandEyeCalibration:
     alternatives: Mapping[str, SE3] = field(default_factory=dict)
     robot: Mapping[str, float] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
+    other_mounts: tuple[Mount, ...] = ()
 
     def __post_init__(self) -> None:
         """Lock; raise InputError unless each camera has a place."""
@@ -117,6 +137,19 @@ class HandEyeCalibration:
             self, "residuals", locked("residuals", self.residuals, (None, 6))
         )
 
+    @property
+    def mounts(self) -> tuple[Mount, ...]:
+        """Every mount, in the order of ``Station.mount``."""
+        return (Mount(self.flange_from_triangle, self.markers), *self.other_mounts)
+
+    def markers_at(self, mounts: NDArray[np.intp]) -> Floats:
+        """A, B, C in the flange frame at stations, shape (n, 3, 3), metres.
+
+        Args:
+            mounts: Of each station, shape (n,), from 0.
+        """
+        return np.array([mount.markers for mount in self.mounts])[mounts]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundTruth:
@@ -129,6 +162,7 @@ class GroundTruth:
         base_from_flange: True flange poses, shape (n, 4, 4), metres.
         markers: True A, B, C in the flange frame, shape (3, 3), metres; None where
             only the triangle's frame is known.
+        other_mounts: How the rig truly sits after a tool change.
     """
 
     cameras: tuple[PinholeCamera, ...]
@@ -136,6 +170,7 @@ class GroundTruth:
     flange_from_triangle: SE3
     base_from_flange: Floats
     markers: Floats | None = None
+    other_mounts: tuple[Mount, ...] = ()
 
     def __post_init__(self) -> None:
         """Lock poses and markers."""

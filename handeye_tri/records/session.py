@@ -28,20 +28,26 @@ class Station:
         kind: "calibration" stations are used, "evaluation" stations held out.
         joints: Shape (q,), rad or m; empty where the robot reports poses only.
         base_from_flange: The pose that the robot reports (in a plan: commands).
+        mount: Which of the cell's mounts holds the triangle there, from 0.
     """
 
     index: int
     kind: StationKind
     joints: Floats
     base_from_flange: SE3
+    mount: int = 0
 
     def __post_init__(self) -> None:
-        """Lock the joints; raise InputError where the kind is none."""
+        """Lock the joints; raise InputError where the kind or the mount is none."""
         object.__setattr__(self, "joints", locked("joints", self.joints, (None,)))
         if self.kind not in get_args(StationKind):
             raise InputError(
                 f"station {self.index}: kind must be one of "
                 f"{', '.join(get_args(StationKind))}, got {self.kind!r}"
+            )
+        if self.mount < 0:
+            raise InputError(
+                f"station {self.index}: mount must be 0 or more, got {self.mount}"
             )
 
 
@@ -99,6 +105,29 @@ class DroppedHalfTurn:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ToolChange:
+    """Where a programme waits for the triangle to be put on another mount.
+
+    Attributes:
+        before: Index of the first station with the other mount.
+        joints: Where the robot waits, shape (q,), rad or m.
+        via: Joints to pass on the way there, shape (k, q), rad or m, straight in
+            joint space from one to the next.
+    """
+
+    before: int
+    joints: Floats
+    via: Floats
+
+    def __post_init__(self) -> None:
+        """Lock the joints; raise InputError where their shapes differ."""
+        joints = locked("joints", self.joints, (None,))
+        object.__setattr__(self, "joints", joints)
+        via = locked("via", self.via, (None, len(joints)))
+        object.__setattr__(self, "via", via)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Plan:
     """A robot programme.
 
@@ -113,6 +142,8 @@ class Plan:
         findings: What is not determined well, and what to do; one sentence each.
         via: Joints to pass on the way to each station, shapes (k, q), rad or m,
             straight in joint space from one to the next; nothing given: no points.
+        tool_change: Where the triangle is put on the cell's other mount; None where
+            all stations have the same one.
     """
 
     stations: tuple[Station, ...]
@@ -123,9 +154,15 @@ class Plan:
     outcome: Literal["PASS", "FAIL", "CANNOT TELL"]
     findings: tuple[str, ...]
     via: tuple[Floats, ...] = ()
+    tool_change: ToolChange | None = None
 
     def __post_init__(self) -> None:
-        """Lock the points passed; raise InputError where they are not one a station."""
+        """Lock the points passed.
+
+        Raises:
+            InputError: they are not one array a station, or the tool change is not
+                where the stations' mount changes.
+        """
         if not self.via:
             straight = tuple(np.zeros((0, len(s.joints))) for s in self.stations)
             object.__setattr__(self, "via", straight)
@@ -136,6 +173,15 @@ class Plan:
             )
         passed = tuple(locked("via", points, (None, None)) for points in self.via)
         object.__setattr__(self, "via", passed)
+        mounts = [s.mount for s in self.stations]
+        changes = [k for k in range(1, len(mounts)) if mounts[k] != mounts[k - 1]]
+        stated = [] if self.tool_change is None else [self.tool_change.before]
+        if changes != stated:
+            raise InputError(
+                f"the stations' mount changes before {changes or 'no station'}, the "
+                f"tool change is before {stated or 'no station'}; there must be one "
+                "tool change, where the mount changes"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,6 +284,12 @@ class Session:
         names = [camera.name for camera in self.cameras]
         if len(set(names)) < m:
             raise InputError(f"camera names must differ, got {', '.join(names)}")
+        carried = set(self.mounts.tolist())
+        if carried != set(range(len(carried))):
+            raise InputError(
+                f"the stations' mounts must be numbered from 0 without a gap, got "
+                f"{sorted(carried)}"
+            )
         for j, station in enumerate(self.stations):
             if station.index != j:
                 raise InputError(
@@ -251,6 +303,11 @@ class Session:
                     raise InputError(
                         f"{turn} uses station {j}, which is held out for evaluation"
                     )
+            if self.stations[turn.before].mount != self.stations[turn.after].mount:
+                raise InputError(
+                    f"{turn} joins stations with different mounts; a half-turn is "
+                    "made without a tool change"
+                )
         seen = np.isfinite(self.pixels).all(axis=-1)
         weighed = np.isfinite(self.pixel_covariance).all(axis=(-2, -1))
         if (seen & ~weighed).any():
@@ -264,6 +321,11 @@ class Session:
     def base_from_flange(self) -> Floats:
         """Robot-reported poses, shape (n, 4, 4), metres."""
         return np.array([s.base_from_flange.matrix for s in self.stations])
+
+    @property
+    def mounts(self) -> NDArray[np.intp]:
+        """Which mount holds the triangle at each station, shape (n,), from 0."""
+        return np.array([s.mount for s in self.stations], dtype=np.intp)
 
     def without(self, dropped: Sequence[DroppedHalfTurn]) -> Session:
         """The same session with the views of these half-turns unseen.

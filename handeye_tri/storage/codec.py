@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -18,8 +18,10 @@ from handeye_tri.records import (
     GroundTruth,
     HalfTurn,
     HandEyeCalibration,
+    Mount,
     Plan,
     Station,
+    ToolChange,
 )
 from handeye_tri.se3 import SE3, quaternion_wxyz, rotation_from_quaternion_wxyz
 
@@ -117,6 +119,7 @@ def plan_to_json(plan: Plan) -> Json:
             {
                 "index": s.index,
                 "kind": s.kind,
+                "mount": s.mount,
                 "via_rad_or_m": via.tolist(),
                 "joints_rad_or_m": s.joints.tolist(),
                 "base_from_flange": motion_to_json(s.base_from_flange),
@@ -131,6 +134,13 @@ def plan_to_json(plan: Plan) -> Json:
         "certificate": dict(plan.certificate),
         "outcome": plan.outcome,
         "findings": list(plan.findings),
+        "tool_change": None
+        if plan.tool_change is None
+        else {
+            "before": plan.tool_change.before,
+            "joints_rad_or_m": plan.tool_change.joints.tolist(),
+            "via_rad_or_m": plan.tool_change.via.tolist(),
+        },
     }
 
 
@@ -143,6 +153,7 @@ def plan_from_json(data: Mapping[str, Any]) -> Plan:
                 s["kind"],
                 array(s["joints_rad_or_m"], "joints_rad_or_m"),
                 motion_from_json(s["base_from_flange"]),
+                int(s.get("mount", 0)),
             )
             for s in data["stations"]
         ),
@@ -156,11 +167,45 @@ def plan_from_json(data: Mapping[str, Any]) -> Plan:
         outcome=data["outcome"],
         findings=tuple(str(line) for line in data["findings"]),
         via=tuple(
-            array(s["via_rad_or_m"], "via_rad_or_m").reshape(
-                len(s["via_rad_or_m"]), len(s["joints_rad_or_m"])
-            )
-            for s in data["stations"]
+            _via(s["via_rad_or_m"], len(s["joints_rad_or_m"])) for s in data["stations"]
         ),
+        tool_change=_tool_change(data.get("tool_change")),
+    )
+
+
+def _via(points: Any, joints: int) -> NDArray[np.float64]:
+    """Joints passed, shape (k, joints); an empty list has lost its width."""
+    return array(points, "via_rad_or_m").reshape(len(points), joints)
+
+
+def _tool_change(data: Mapping[str, Any] | None) -> ToolChange | None:
+    if data is None:
+        return None
+    joints = array(data["joints_rad_or_m"], "joints_rad_or_m")
+    return ToolChange(
+        int(data["before"]), joints, _via(data["via_rad_or_m"], len(joints))
+    )
+
+
+def _mounts_to_json(mounts: Sequence[Mount]) -> list[Json]:
+    """How the rig sits after a tool change."""
+    return [
+        {
+            "flange_from_triangle": motion_to_json(mount.flange_from_triangle),
+            "markers_in_flange_m": numbers(mount.markers),
+        }
+        for mount in mounts
+    ]
+
+
+def _mounts_from_json(data: Sequence[Mapping[str, Any]]) -> tuple[Mount, ...]:
+    """Inverse of :func:`_mounts_to_json`."""
+    return tuple(
+        Mount(
+            motion_from_json(one["flange_from_triangle"]),
+            array(one["markers_in_flange_m"], "markers_in_flange_m"),
+        )
+        for one in data
     )
 
 
@@ -178,6 +223,7 @@ def truth_to_json(truth: GroundTruth, joints: NDArray[np.float64]) -> Json:
         "markers_in_flange_m": None
         if truth.markers is None
         else numbers(truth.markers),
+        "other_mounts": _mounts_to_json(truth.other_mounts),
         "executed_joints_rad_or_m": numbers(joints),
     }
 
@@ -193,6 +239,7 @@ def truth_from_json(data: Mapping[str, Any]) -> tuple[GroundTruth, NDArray[np.fl
             [motion_from_json(m).matrix for m in data["base_from_flange"]]
         ),
         markers=None if markers is None else array(markers, "markers_in_flange_m"),
+        other_mounts=_mounts_from_json(data.get("other_mounts", ())),
     )
     return truth, array(data["executed_joints_rad_or_m"], "executed_joints_rad_or_m")
 
@@ -273,6 +320,7 @@ def hand_eye_to_json(result: HandEyeCalibration) -> Json:
         },
         "flange_from_triangle": motion_to_json(result.flange_from_triangle),
         "markers_in_flange_m": numbers(result.markers),
+        "other_mounts": _mounts_to_json(result.other_mounts),
         "chi2": result.chi2,
         "dof": result.dof,
         "covariance": covariance_to_json(result.covariance),
@@ -295,6 +343,7 @@ def hand_eye_from_json(data: Mapping[str, Any]) -> HandEyeCalibration:
         ),
         flange_from_triangle=motion_from_json(data["flange_from_triangle"]),
         markers=array(data["markers_in_flange_m"], "markers_in_flange_m"),
+        other_mounts=_mounts_from_json(data.get("other_mounts", ())),
         covariance=covariance_from_json(data["covariance"]),
         chi2=float(data["chi2"]),
         dof=int(data["dof"]),

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from handeye_tri.errors import InputError
-from handeye_tri.records import Covariance, motion_labels
+from handeye_tri.records import (
+    MARKER_LABELS,
+    Covariance,
+    marker_labels,
+    motion_labels,
+    triangle_name,
+)
 
 ROOT = np.array([[2.0, 0, 0], [1, 3, 0], [-1, 0.5, 0.1]])
 MATRIX = ROOT @ ROOT.T
@@ -60,4 +66,16 @@ def test_rounding_is_no_asymmetry() -> None:
 def test_labels_of_a_motion_follow_its_tangent() -> None:
     assert motion_labels("base_from_left") == tuple(
         f"base_from_left.{quantity}" for quantity in ("x", "y", "z", "rx", "ry", "rz")
+    )
+
+
+def test_a_second_mount_has_names_of_its_own() -> None:
+    assert marker_labels() == MARKER_LABELS
+    assert marker_labels(1)[:4] == (
+        *("marker_A_2.x", "marker_A_2.y", "marker_A_2.z"),
+        "marker_B_2.x",
+    )
+    assert (triangle_name(), triangle_name(1)) == (
+        "flange_from_triangle",
+        "flange_from_triangle_2",
     )

@@ -14,6 +14,7 @@ from handeye_tri.records import (
     Covariance,
     GroundTruth,
     HandEyeCalibration,
+    Mount,
     TrackEvaluation,
 )
 from handeye_tri.se3 import SE3
@@ -127,3 +128,22 @@ def test_hand_eye_and_truth_lock_and_check() -> None:
         GroundTruth((CAMERA,), (SE3.identity(),), SE3.identity(), np.eye(4))
     with pytest.raises(InputError, match="markers must have shape"):
         GroundTruth((CAMERA,), (SE3.identity(),), SE3.identity(), [np.eye(4)], [[0.0]])  # type: ignore[arg-type]
+
+
+def test_markers_at_stations_are_those_of_their_mount() -> None:
+    first, second = np.eye(3), 2.0 * np.eye(3)
+    calibration = HandEyeCalibration(
+        cameras=(CAMERA,),
+        base_from_camera=(SE3.identity(),),
+        flange_from_triangle=SE3.identity(),
+        markers=first,
+        covariance=NOTHING,
+        chi2=1.0,
+        dof=1,
+        residuals=np.zeros((2, 6)),
+        method="",
+        other_mounts=(Mount(SE3.identity(), second),),
+    )
+    found = calibration.markers_at(np.array([1, 0, 1]))
+    np.testing.assert_array_equal(found, [second, first, second])
+    assert len(calibration.mounts) == 2

@@ -12,9 +12,11 @@ from handeye_tri.errors import InputError
 from handeye_tri.records import (
     CameraInfo,
     HalfTurn,
+    Plan,
     Repeatability,
     Session,
     Station,
+    ToolChange,
 )
 from handeye_tri.se3 import SE3
 from handeye_tri.triangle import TriangleRig
@@ -128,3 +130,66 @@ def test_repeatability_is_a_deviation(bad: float) -> None:
 def test_repeatability_covariance_is_translation_first() -> None:
     expected = [9e-10] * 3 + [4e-8] * 3
     assert np.diag(Repeatability(3e-5, 2e-4).covariance) == pytest.approx(expected)
+
+
+def on_mounts(*mounts: int) -> tuple[Station, ...]:
+    return tuple(
+        dataclasses.replace(station(j), mount=mount) for j, mount in enumerate(mounts)
+    )
+
+
+def test_each_station_has_a_mount() -> None:
+    assert session().mounts.tolist() == [0, 0, 0]
+    record = session(stations=on_mounts(0, 0, 1), half_turns=())
+    assert record.mounts.tolist() == [0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("mounts", "turns", "message"),
+    [
+        ((0, 0, 2), (), r"without a gap, got \[0, 2\]"),
+        ((1, 1, 1), (), r"without a gap, got \[1\]"),
+        ((0, 1, 1), (HalfTurn(0, 1, "normal"),), "different mounts"),
+    ],
+)
+def test_mounts_that_do_not_fit(
+    mounts: tuple[int, ...], turns: tuple[HalfTurn, ...], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        session(stations=on_mounts(*mounts), half_turns=turns)
+
+
+def test_a_mount_is_counted_from_zero() -> None:
+    with pytest.raises(InputError, match="station 0: mount must be 0 or more, got -1"):
+        dataclasses.replace(station(0), mount=-1)
+
+
+def plan(*mounts: int, change: ToolChange | None) -> Plan:
+    stations = on_mounts(*mounts)
+    return Plan(stations, (), {}, {}, 0, "PASS", (), tool_change=change)
+
+
+def test_a_plan_states_its_tool_change() -> None:
+    change = ToolChange(2, np.zeros(6), np.zeros((1, 6)))
+    assert plan(0, 0, 1, change=change).tool_change is change
+    assert not change.joints.flags.writeable
+    assert not change.via.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("mounts", "before"),
+    [((0, 0, 1), None), ((0, 0, 1), 1), ((0, 0), 1), ((0, 1, 0), 1)],
+)
+def test_a_tool_change_is_where_the_mount_changes(
+    mounts: tuple[int, ...], before: int | None
+) -> None:
+    change = None
+    if before is not None:
+        change = ToolChange(before, np.zeros(6), np.zeros((0, 6)))
+    with pytest.raises(InputError, match="one tool change, where the mount changes"):
+        plan(*mounts, change=change)
+
+
+def test_a_tool_change_passes_joints_of_one_arm() -> None:
+    with pytest.raises(InputError, match="via must have shape"):
+        ToolChange(1, np.zeros(6), np.zeros((2, 7)))

@@ -12,8 +12,10 @@ from handeye_tri.records import (
     GroundTruth,
     HalfTurn,
     HandEyeCalibration,
+    Mount,
     Plan,
     Station,
+    ToolChange,
 )
 from handeye_tri.se3 import SE3
 from handeye_tri.storage import codec
@@ -86,6 +88,30 @@ def test_plan():
         assert (ours.index, ours.kind) == (theirs.index, theirs.kind)
         assert np.array_equal(ours.joints, theirs.joints)
         assert close(ours.base_from_flange, theirs.base_from_flange)
+
+
+def test_a_plan_with_a_tool_change():
+    stations = tuple(
+        Station(i, "calibration", RNG.normal(size=6), MOTION, mount)
+        for i, mount in enumerate((0, 1))
+    )
+    change = ToolChange(1, RNG.normal(size=6), RNG.normal(size=(0, 6)))
+    plan = Plan(stations, (), {}, {}, 7, "PASS", (), tool_change=change)
+    back = codec.plan_from_json(through_text(codec.plan_to_json(plan)))
+    assert [s.mount for s in back.stations] == [0, 1]
+    assert back.tool_change.before == 1
+    assert np.array_equal(back.tool_change.joints, change.joints)
+    assert back.tool_change.via.shape == (0, 6)
+
+
+def test_a_truth_with_a_second_mount():
+    second = Mount(HALF_TURN, RNG.normal(size=(3, 3)))
+    poses = MOTION.matrix[None]
+    truth = GroundTruth((CAMERA,), (MOTION,), MOTION, poses, None, (second,))
+    data = through_text(codec.truth_to_json(truth, np.zeros((1, 6))))
+    (back,) = codec.truth_from_json(data)[0].other_mounts
+    assert np.array_equal(back.markers, second.markers)
+    assert close(back.flange_from_triangle, HALF_TURN)
 
 
 def test_truth():
