@@ -6,17 +6,19 @@ that estimators can be measured in milliseconds against a known truth.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
+from handeye_tri.camera.outlines import outline_centroids
 from handeye_tri.errors import InputError, NoPlanError
 from handeye_tri.records import (
     CameraInfo,
     GroundTruth,
     HalfTurn,
+    Mount,
     Repeatability,
     Session,
     Station,
@@ -29,6 +31,8 @@ Floats = NDArray[np.float64]
 
 REFERENCE_TRIANGLE = TriangleRig(0.13, 0.12, float(np.radians(65)))
 _FLANGE_FROM_TRIANGLE = SE3.exp((0.02, -0.03, 0.09, 0.15, -0.1, 0.35))
+# The same triangle on another holder.
+_SECOND_MOUNT = SE3.exp((-0.04, 0.02, 0.11, 1.2, 0.4, -0.6))
 # The box in which the reference stations keep the triangle's centroid, metres in base.
 _WORKSPACE = np.array([[0.35, -0.15, 0.27], [0.60, 0.15, 0.57]])
 _LOOK_AT = np.array([0.45, 0.0, 0.42])
@@ -37,8 +41,6 @@ _MIN_PLANE_ANGLE = np.radians(20.0)
 # Markers stay this far from the image's border, pixels.
 _MARGIN = 25.0
 _MAX_CANDIDATES = 400
-# Points on an outline; sums over a period converge exponentially, here to rounding.
-_OUTLINE_POINTS = 48
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +54,7 @@ class Geometry:
         base_from_camera: Where they stand.
         stations: The n stations with their commanded poses.
         half_turns: Pairs of calibration stations.
+        other_mounts: How the triangle sits after a tool change.
     """
 
     triangle: TriangleRig
@@ -60,6 +63,37 @@ class Geometry:
     base_from_camera: tuple[SE3, ...]
     stations: tuple[Station, ...]
     half_turns: tuple[HalfTurn, ...]
+    other_mounts: tuple[SE3, ...] = ()
+
+    def followed_by(self, then: Geometry) -> Geometry:
+        """This programme, a tool change, then the other one.
+
+        Args:
+            then: The same triangle and cameras; its own mount becomes the last.
+
+        Raises:
+            InputError: it has a tool change already.
+        """
+        if then.other_mounts:
+            raise InputError(
+                "then must have one mount, got "
+                f"{1 + len(then.other_mounts)}; follow with one after the other"
+            )
+        count, mount = len(self.stations), 1 + len(self.other_mounts)
+        stations = (
+            replace(station, index=count + station.index, mount=mount)
+            for station in then.stations
+        )
+        turns = (
+            HalfTurn(count + turn.before, count + turn.after, turn.axis)
+            for turn in then.half_turns
+        )
+        return replace(
+            self,
+            stations=(*self.stations, *stations),
+            half_turns=(*self.half_turns, *turns),
+            other_mounts=(*self.other_mounts, then.flange_from_triangle),
+        )
 
 
 def look_at(position: ArrayLike, target: ArrayLike) -> SE3:
@@ -96,6 +130,7 @@ def reference_geometry(
     skew: float = 0.0,
     lens: Lens | None = None,
     triangle: TriangleRig = REFERENCE_TRIANGLE,
+    flange_from_triangle: SE3 = _FLANGE_FROM_TRIANGLE,
     baseline: float = 0.25,
     distance: float = 0.9,
 ) -> Geometry:
@@ -114,6 +149,7 @@ def reference_geometry(
         skew: Skew factor of both cameras, pixels.
         lens: Lens of both cameras; None for pinholes.
         triangle: The rig.
+        flange_from_triangle: How it sits on the flange.
         baseline: Distance of the two cameras, metres.
         distance: From the cameras to the workspace, metres.
 
@@ -134,7 +170,7 @@ def reference_geometry(
     turn = triangle.half_turn(
         axis, triangle.circumcentre if axis == "normal" else None
     ).matrix
-    triangle_from_flange = se3_inverse(_FLANGE_FROM_TRIANGLE.matrix)
+    triangle_from_flange = se3_inverse(flange_from_triangle.matrix)
     poses: list[Floats] = []
     turns: list[HalfTurn] = []
     normal: Floats | None = None
@@ -159,12 +195,48 @@ def reference_geometry(
     )
     return Geometry(
         triangle,
-        _FLANGE_FROM_TRIANGLE,
+        flange_from_triangle,
         cameras,
         base_from_camera,
         stations,
         tuple(turns),
     )
+
+
+def two_mount_geometry(
+    rng: np.random.Generator,
+    *,
+    half_turns: int = 6,
+    evaluation_stations: int = 3,
+    axes: tuple[Axis, Axis] = ("normal", "BC"),
+    lens: Lens | None = None,
+) -> Geometry:
+    """The reference cell with a tool change between two programmes.
+
+    Args:
+        rng: Source of the poses.
+        half_turns: How many with each mount.
+        evaluation_stations: How many held-out stations with each mount.
+        axes: What the half-turns turn about, by mount.
+        lens: Lens of both cameras; None for pinholes.
+
+    Raises:
+        NoPlanError: a station found no pose in 400 candidates.
+    """
+    first, then = (
+        reference_geometry(
+            rng,
+            half_turns=half_turns,
+            evaluation_stations=evaluation_stations,
+            axis=axis,
+            lens=lens,
+            flange_from_triangle=mount,
+        )
+        for axis, mount in zip(
+            axes, (_FLANGE_FROM_TRIANGLE, _SECOND_MOUNT), strict=True
+        )
+    )
+    return first.followed_by(then)
 
 
 def _kind(index: int, calibration_stations: int) -> StationKind:
@@ -269,15 +341,20 @@ def synthesize(
     sigma = np.repeat([repeats.translation, repeats.rotation], 3)
     executed = reported @ se3_exp(sigma * rng.standard_normal((n, 6)))
     noise = sigma_px * rng.standard_normal((m, n, 3, 2))
-    flange_points = geometry.flange_from_triangle.apply(geometry.triangle.points)
+    mounts = tuple(
+        Mount(motion, motion.apply(geometry.triangle.points))
+        for motion in (geometry.flange_from_triangle, *geometry.other_mounts)
+    )
+    carried = [station.mount for station in geometry.stations]
+    flange_points = np.array([mount.markers for mount in mounts])[carried]
     base_points = (
-        np.einsum("nab,kb->nka", executed[:, :3, :3], flange_points)
+        np.einsum("nab,nkb->nka", executed[:, :3, :3], flange_points)
         + executed[:, None, :3, 3]
     )
     pixels = np.empty((m, n, 3, 2))
     for i, camera in enumerate(geometry.cameras):
         points = geometry.base_from_camera[i].inverse().apply(base_points)
-        exact = _outline_centroids(camera, points, radii)
+        exact = outline_centroids(camera, points, radii)
         limit = np.array(camera.image_size, dtype=float) - 0.5
         inside = ((exact > -0.5) & (exact < limit)).all(axis=-1, keepdims=True)
         pixels[i] = np.where(inside, exact + noise[i], np.nan)
@@ -314,44 +391,7 @@ def synthesize(
         geometry.base_from_camera,
         geometry.flange_from_triangle,
         executed,
-        flange_points,
+        mounts[0].markers,
+        mounts[1:],
     )
     return session, truth
-
-
-def _outline_centroids(camera: PinholeCamera, points: Floats, radii: Floats) -> Floats:
-    """Centroids of the areas that spheres cover, (..., 2); points where r is 0.
-
-    Tangents from the camera touch a sphere of radius r at distance d on a circle
-    around P (1 - r^2 / d^2) of radius r sqrt(1 - r^2 / d^2); the circle is projected
-    point by point, lens included. With the outline p(t), area and moment are the
-    integrals of (p x p') / 2 and p (p x p') / 3 (Green's theorem).
-    """
-    centre = camera.project(points)
-    if not radii.any():
-        return centre
-    distance = np.linalg.norm(points, axis=-1, keepdims=True)
-    toward = points / distance
-    across = np.cross(toward, (0.0, 1.0, 0.0))
-    across /= np.linalg.norm(across, axis=-1, keepdims=True)
-    up = np.cross(toward, across)
-    inside = 1.0 - (radii[:, None] / distance) ** 2
-    reach = (radii[:, None] * np.sqrt(inside))[..., None, :]
-    angle = np.linspace(0.0, 2 * np.pi, _OUTLINE_POINTS, endpoint=False)[:, None]
-    circle = (points * inside)[..., None, :] + reach * (
-        np.cos(angle) * across[..., None, :] + np.sin(angle) * up[..., None, :]
-    )
-    turning = reach * (
-        np.cos(angle) * up[..., None, :] - np.sin(angle) * across[..., None, :]
-    )
-    outline, by_point, _, _ = camera.project_jacobians(circle)
-    # Relative to the projected centre, so that small areas keep their digits.
-    outline = outline - centre[..., None, :]
-    tangent = (by_point @ turning[..., None])[..., 0]
-    sector = (outline[..., 0] * tangent[..., 1] - outline[..., 1] * tangent[..., 0])[
-        ..., None
-    ]
-    moment = (sector * outline).sum(axis=-2)
-    with np.errstate(invalid="ignore"):
-        shift = moment / (1.5 * sector.sum(axis=-2))
-    return np.where(radii[:, None] > 0, centre + shift, centre)

@@ -8,7 +8,11 @@ from handeye_tri.camera import Lens
 from handeye_tri.errors import InputError, NoPlanError
 from handeye_tri.records import Repeatability
 from handeye_tri.se3 import se3_inverse, se3_log
-from handeye_tri.synthesize import reference_geometry, synthesize
+from handeye_tri.synthesize import (
+    reference_geometry,
+    synthesize,
+    two_mount_geometry,
+)
 
 
 @pytest.mark.parametrize("axis", ["normal", "AB", "BC", "CA"])
@@ -160,3 +164,41 @@ def test_bad_input_is_named():
     with pytest.raises(NoPlanError, match="farther away") as caught:
         reference_geometry(rng, distance=0.3)
     assert caught.value.rejected["view"] > 0
+
+
+def test_after_a_tool_change_the_triangle_sits_otherwise():
+    geometry = two_mount_geometry(
+        np.random.default_rng(2), half_turns=3, evaluation_stations=1
+    )
+    session, truth = synthesize(geometry, np.random.default_rng(3), sigma_px=0.0)
+    assert session.mounts.tolist() == 7 * [0] + 7 * [1]
+    assert [turn.axis for turn in session.half_turns] == 3 * ["normal"] + 3 * ["BC"]
+    kinds = [station.kind for station in session.stations]
+    assert kinds == 2 * (6 * ["calibration"] + ["evaluation"])
+    (second,) = truth.other_mounts
+    assert second.flange_from_triangle == geometry.other_mounts[0]
+    for j, mount in ((6, truth), (13, second)):
+        base = session.stations[j].base_from_flange.apply(mount.markers)
+        local = geometry.base_from_camera[1].inverse().apply(base)
+        exact = geometry.cameras[1].project(local)
+        np.testing.assert_allclose(session.pixels[1, j], exact, atol=1e-9)
+    turn = session.half_turns[-1]
+    before, after = (
+        session.stations[j].base_from_flange @ second.flange_from_triangle
+        for j in (turn.before, turn.after)
+    )
+    np.testing.assert_allclose(
+        (before.inverse() @ after).matrix,
+        geometry.triangle.half_turn("BC").matrix,
+        atol=1e-14,
+    )
+
+
+def test_one_tool_change_after_the_other():
+    rng = np.random.default_rng(0)
+    one = reference_geometry(rng, half_turns=1, evaluation_stations=0)
+    both = one.followed_by(one)
+    mounts = [station.mount for station in both.followed_by(one).stations]
+    assert mounts == [0, 0, 1, 1, 2, 2]
+    with pytest.raises(InputError, match="then must have one mount, got 2"):
+        one.followed_by(both)
