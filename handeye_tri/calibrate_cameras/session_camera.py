@@ -45,7 +45,12 @@ def turn_covariance(repeatability: Repeatability) -> Floats:
 
 
 def alone(
-    session: Session, i: int, shift: Floats, *, reject: bool = False
+    session: Session,
+    i: int,
+    shift: Floats,
+    *,
+    refine: bool = True,
+    reject: bool = False,
 ) -> CameraCalibration:
     """Calibrate camera i from its half-turns.
 
@@ -53,6 +58,8 @@ def alone(
         session: Half-turns and pixels.
         i: Index of the camera.
         shift: What is taken off its pixels, shape (n, 3, 2).
+        refine: False stops at the closed form, which knows neither a lens nor that
+            the robot's half-turns are inexact.
         reject: Leave out half-turns that disagree with the others.
 
     Raises:
@@ -81,9 +88,10 @@ def alone(
             image_size=info.image_size,
             axis=[turn.axis for turn in session.half_turns],
             skew=info.skew,
-            distortion=info.lens or None,
+            distortion=(info.lens or None) if refine else None,
             covariance=np.stack([covariance[before], covariance[after]], axis=1),
-            turn_covariance=turn_covariance(session.repeatability),
+            turn_covariance=turn_covariance(session.repeatability) if refine else None,
+            refine=refine,
             reject=reject,
             name=info.name,
         )

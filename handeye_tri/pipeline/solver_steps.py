@@ -42,8 +42,8 @@ def solver_steps(
         ("refined, each camera alone", True),
     ):
         with contextlib.suppress(HandEyeError):
-            alone = _each_alone(session, result, refine=refine)
-            steps.append(SolverStep(words, alone))
+            apart = _each_alone(session, result, refine=refine)
+            steps.append(SolverStep(words, apart))
     with contextlib.suppress(HandEyeError):
         together = calibrate_hand_eye(session, cameras)
         steps.append(SolverStep("all cameras together, then hand-eye", together))
@@ -53,28 +53,21 @@ def solver_steps(
 def _each_alone(
     session: Session, result: HandEyeCalibration, *, refine: bool
 ) -> HandEyeCalibration:
-    """Each camera from its half-turns (Sec. III), placed by AX = ZB in closed form."""
-    from handeye_tri.calibrate_cameras import calibrate_camera
+    """Each camera from its half-turns (Sec. III), placed by AX = ZB in closed form.
+
+    Spheres' centres are taken to be where they seem, since only calibrated cameras
+    tell how far off that is.
+    """
+    from handeye_tri.calibrate_cameras.session_camera import alone
     from handeye_tri.hand_eye import solve_axzb
 
     before = [turn.before for turn in session.half_turns]
     after = [turn.after for turn in session.half_turns]
     reported = session.base_from_flange[before + after]
+    no_shift = np.zeros((len(session.stations), 3, 2))
     cameras, seen, rigs = [], [], []
-    for i, info in enumerate(session.cameras):
-        pixels, covariance = session.pixels[i], session.pixel_covariance[i]
-        one = calibrate_camera(
-            pixels[before],
-            pixels[after],
-            session.triangle,
-            image_size=info.image_size,
-            axis=[turn.axis for turn in session.half_turns],
-            skew=info.skew,
-            distortion=info.lens or None,
-            covariance=np.stack([covariance[before], covariance[after]], axis=1),
-            refine=refine,
-            name=info.name,
-        )
+    for i in range(len(session.cameras)):
+        one = alone(session, i, no_shift, refine=refine)
         poses = np.concatenate(
             [
                 one.details["camera_from_triangle"],
