@@ -75,8 +75,10 @@ def _simulate(run: Run) -> tuple[list[str], str]:
     names = [camera.name for camera in run.cell.cameras]
     views = [(i, j) for j in range(len(plan.stations)) for i in range(len(names))]
     # Views that an interrupted run left are used only if they are of this very task.
+    mounts = [station.mount for station in plan.stations]
     task = {"joints": joints.tolist(), "cell": run.folder.header["cell"]}
-    started = storage.fingerprint({**task, "seed": run.seed}).encode()
+    task |= {"mounts": mounts, "seed": run.seed}
+    started = storage.fingerprint(task).encode()
     mark = run.folder.file("images/.started")
     missing = views
     if mark.is_file() and mark.read_bytes() == started:
@@ -93,7 +95,8 @@ def _simulate(run: Run) -> tuple[list[str], str]:
     with ThreadPoolExecutor(1) as writer:
         pending = []
         for i, j, image in simulate.render_views(
-            run.designed_cell, run.model_path, joints, run.seed, missing
+            *(run.designed_cell, run.model_path, joints, run.seed, missing),
+            mounts=mounts,
         ):
             path = run.folder.file(run.image_name(names[i], j))
             pending.append(writer.submit(storage.write_image, path, image))
@@ -250,13 +253,16 @@ def _report(run: Run) -> tuple[list[str], str]:
     )
 
 
+# The triangle, and how it is held.
+_HELD = ("rig", "second_mount")
+
 STAGES = {
     stage.name: stage
     for stage in (
         Stage(
             "plan",
             "plan",
-            ("arm", "rig", "cameras", "surroundings", "plan"),
+            ("arm", *_HELD, "cameras", "surroundings", "plan"),
             (),
             _plan,
             ("stations_rad_or_m",),
@@ -264,17 +270,17 @@ STAGES = {
         Stage(
             "simulate",
             "simulate",
-            ("arm", "rig", "cameras", "surroundings", "imaging"),
+            ("arm", *_HELD, "cameras", "surroundings", "imaging"),
             ("plan",),
             _simulate,
             preflight=_check_rendering,
         ),
         Stage("detect", "detect", ("rig", "cameras"), ("simulate",), _detect),
-        Stage("cameras", "calibrate", ("rig", "arm"), ("plan", "detect"), _cameras),
+        Stage("cameras", "calibrate", (*_HELD, "arm"), ("plan", "detect"), _cameras),
         Stage(
             "hand_eye",
             "calibrate",
-            ("rig", "arm"),
+            (*_HELD, "arm"),
             ("plan", "detect", "cameras"),
             _hand_eye,
             ("method", "robot_errors"),
@@ -282,7 +288,7 @@ STAGES = {
         Stage(
             "evaluate",
             "evaluate",
-            ("rig", "arm", "plan", "track_limit_mm"),
+            (*_HELD, "arm", "plan", "track_limit_mm"),
             ("plan", "simulate", "detect", "cameras", "hand_eye"),
             evaluate,
             ("method", "robot_errors"),
@@ -290,7 +296,7 @@ STAGES = {
         Stage(
             "report",
             "report",
-            ("name", "arm", "rig", "cameras", "surroundings"),
+            ("name", "arm", *_HELD, "cameras", "surroundings"),
             ("plan", "simulate", "detect", "cameras", "hand_eye", "evaluate"),
             _report,
         ),

@@ -46,6 +46,8 @@ def render_views(
     seed: int,
     wanted: Iterable[tuple[int, int]],
     props: Sequence[Prop] = (),
+    *,
+    mounts: Sequence[int] | None = None,
 ) -> Iterator[tuple[int, int, Image]]:
     """Photograph the arm at its stations.
 
@@ -56,16 +58,41 @@ def render_views(
         seed: Of the sensor noise; each view has its own stream.
         wanted: Pairs (camera index, station index).
         props: What stands in the cell at some stations.
+        mounts: Which of the cell's mounts holds the triangle at each station; None:
+            the first everywhere.
 
     Yields:
         Camera index, station index, and the image: RGB, shape (h, w, 3), or (h, w)
-        in a grey cell; in the order of ``wanted``.
+        in a grey cell; mount by mount, in the order of ``wanted``.
 
     Raises:
-        InputError: as :func:`compile_mechanism`; the joints do not fit the arm; or
-            a lens cannot be inverted inside its image.
+        InputError: as :func:`compile_mechanism`; the joints do not fit the arm; the
+            cell has no such mount; or a lens cannot be inverted inside its image.
         MissingDependencyError: OpenGL is missing.
     """
+    if mounts is None:
+        mounts = np.zeros(len(np.asarray(joints)), dtype=np.intp).tolist()
+    if max(mounts, default=0) >= len(cell.mounted):
+        raise InputError(
+            f"mounts must be below {len(cell.mounted)}, since cell {cell.name} has so "
+            f"many, got {max(mounts)}; plan again for this cell"
+        )
+    views = list(wanted)
+    for mount, alone in enumerate(cell.mounted):
+        chosen = [view for view in views if mounts[view[1]] == mount]
+        if chosen:
+            yield from _render(alone, model_path, joints, seed, chosen, props)
+
+
+def _render(
+    cell: Cell,
+    model_path: Path,
+    joints: ArrayLike,
+    seed: int,
+    wanted: Sequence[tuple[int, int]],
+    props: Sequence[Prop],
+) -> Iterator[tuple[int, int, Image]]:
+    """The views with one mount, as :func:`render_views`."""
     mujoco = import_mujoco()
     model, mechanism = compile_cell(cell, model_path, props)
     order = [int(model.jnt_qposadr[k]) for k in mechanism.arm_joints]

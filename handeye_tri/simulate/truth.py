@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from handeye_tri.errors import InputError
-from handeye_tri.records import Floats, GroundTruth, Plan, Repeatability
+from handeye_tri.records import Floats, GroundTruth, Mount, Plan, Repeatability
 
 if TYPE_CHECKING:
     from handeye_tri.arm import Arm
@@ -48,16 +48,22 @@ def ground_truth(cell: Cell, arm: Arm, joints: ArrayLike) -> GroundTruth:
     """The truth of a simulated cell in the robot's base frame.
 
     Args:
-        cell: True cameras, where they stand, and the rig.
+        cell: True cameras, where they stand, and how the rig is held.
         arm: The robot.
         joints: Executed joints, shape (n, q), rad or m.
     """
+    points = cell.rig.triangle.points
+    first, *others = (
+        Mount(motion, motion.apply(points))
+        for motion in (alone.rig.flange_from_triangle for alone in cell.mounted)
+    )
     return GroundTruth(
         cameras=tuple(camera.camera for camera in cell.cameras),
         base_from_camera=tuple(
             arm.base_from_world @ camera.world_from_camera for camera in cell.cameras
         ),
-        flange_from_triangle=cell.rig.flange_from_triangle,
+        flange_from_triangle=first.flange_from_triangle,
         base_from_flange=arm.forward(joints),
-        markers=cell.rig.flange_from_triangle.apply(cell.rig.triangle.points),
+        markers=first.markers,
+        other_mounts=tuple(others),
     )

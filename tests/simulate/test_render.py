@@ -116,6 +116,23 @@ def test_views_do_not_depend_on_order_or_company() -> None:
     assert difference.std() == pytest.approx(np.sqrt(2) * 5.1, rel=0.05)
 
 
+def test_each_station_shows_its_own_mount() -> None:
+    cell = small_cell(second_mount={"axis": "BC", "ahead_mm": 90, "turn_deg": 40})
+    joints = np.concatenate([facing(alone, 1) for alone in cell.mounted])
+    views = [(0, 1), (0, 0), (1, 1)]
+    drawn = [
+        ((i, j), image)
+        for i, j, image in render_views(cell, GANTRY, joints, 4, views, mounts=[0, 1])
+    ]
+    assert [view for view, _ in drawn] == [(0, 0), (0, 1), (1, 1)]
+    for view, image in drawn:
+        alone = cell.mounted[view[1]]
+        ((_, _, expected),) = render_views(alone, GANTRY, joints, 4, [view])
+        np.testing.assert_array_equal(image, expected)
+    with pytest.raises(InputError, match="mounts must be below 2, .* so many, got 2"):
+        next(render_views(cell, GANTRY, joints, 4, views, mounts=[0, 2]))
+
+
 def test_two_renderings_at_once_do_not_mix() -> None:
     cell = small_cell()
     model = GANTRY

@@ -72,3 +72,19 @@ def test_the_truth_is_in_the_base_frame() -> None:
     np.testing.assert_allclose(
         SE3(truth.base_from_flange[0]).apply(markers), arm.marker_positions(joints)[0]
     )
+
+
+def test_the_truth_knows_how_each_mount_holds_the_triangle() -> None:
+    cell = shipped("hp3_stereo_both")
+    arms = [Arm(compile_mechanism(alone, HP3)) for alone in cell.mounted]
+    joints = np.array([[0.1, 0.2, -0.5, 0.4, 0.9, -0.3]])
+    truth = ground_truth(cell, arms[0], joints)
+    (other,) = truth.other_mounts
+    np.testing.assert_allclose(
+        SE3(truth.base_from_flange[0]).apply(other.markers),
+        arms[1].marker_positions(joints)[0],
+    )
+    np.testing.assert_allclose(
+        other.flange_from_triangle.apply(cell.rig.triangle.points), other.markers
+    )
+    assert ground_truth(cell.mounted[0], arms[0], joints).other_mounts == ()
