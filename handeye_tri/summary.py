@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 
 from handeye_tri.camera import INTRINSIC_NAMES
 from handeye_tri.counting import counted
-from handeye_tri.records import GroundTruth, HandEyeCalibration, Plan, motion_labels
+from handeye_tri.records import (
+    GroundTruth,
+    HandEyeCalibration,
+    Plan,
+    motion_labels,
+    triangle_name,
+)
 from handeye_tri.se3 import SE3, so3_left_jacobian_inverse, so3_log
 
 Floats = NDArray[np.float64]
@@ -338,8 +344,15 @@ def result_rows(
             zip(calibration.cameras, calibration.base_from_camera, strict=True)
         )
     ]
-    true_rig = truth.flange_from_triangle if truth else None
-    motions.append(("flange_from_triangle", calibration.flange_from_triangle, true_rig))
+    true_rigs: list[SE3 | None] = [None] * len(calibration.mounts)
+    if truth:
+        others = [mount.flange_from_triangle for mount in truth.other_mounts]
+        true_rigs = [truth.flange_from_triangle, *others]
+    # A mount that no station had is not estimated.
+    for k, (mount, true_rig) in enumerate(
+        zip(calibration.mounts, true_rigs, strict=False)
+    ):
+        motions.append((triangle_name(k), mount.flange_from_triangle, true_rig))
     for name, motion, true_motion in motions:
         block = covariance.block(motion_labels(name))
         rows += motion_rows(name, motion, block, true_motion)

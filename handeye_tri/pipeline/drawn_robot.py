@@ -21,12 +21,12 @@ class DrawnRobot:
     """Bodies and where they are.
 
     Attributes:
-        mechanism: The bodies with their solids.
+        mechanisms: The bodies with their solids, by mount.
         world_from_body: Shape (stations, bodies, 4, 4), metres.
         base_from_world: The base that poses refer to.
     """
 
-    mechanism: Mechanism
+    mechanisms: tuple[Mechanism, ...]
     world_from_body: Floats
     base_from_world: SE3
 
@@ -36,12 +36,15 @@ def drawn_robot(run: Run, session: Session, hand_eye: HandEyeCalibration) -> Dra
     if run.has_robot:
         joints = np.array([station.joints for station in session.stations])
         return DrawnRobot(
-            run.mechanism, run.arm.body_poses(joints), run.arm.base_from_world
+            run.mechanisms, run.arm.body_poses(joints), run.arm.base_from_world
         )
     poses = np.tile(np.eye(4), (len(session.stations), 3, 1, 1))
     poses[:, 2] = session.base_from_flange
     return DrawnRobot(
-        _flange_and_markers(run, hand_eye.markers, session.marker_radii),
+        tuple(
+            _flange_and_markers(run, mount.markers, session.marker_radii)
+            for mount in hand_eye.mounts
+        ),
         poses,
         SE3.identity(),
     )

@@ -210,7 +210,7 @@ def _report(run: Run) -> tuple[list[str], str]:
     replay.write_recording(
         recording,
         name=run.cell.name,
-        mechanism=drawn.mechanism,
+        mechanisms=drawn.mechanisms,
         world_from_body=drawn.world_from_body,
         base_from_world=drawn.base_from_world,
         session=session,

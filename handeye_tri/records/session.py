@@ -327,6 +327,18 @@ class Session:
         """Which mount holds the triangle at each station, shape (n,), from 0."""
         return np.array([s.mount for s in self.stations], dtype=np.intp)
 
+    def mount_name(self, mount: int) -> str:
+        """What a person calls a mount (from 0): by its number and its half-turns."""
+        axes = dict.fromkeys(
+            turn.axis
+            for turn in self.half_turns
+            if self.stations[turn.before].mount == mount
+        )
+        about = " and ".join(
+            "a normal" if axis == "normal" else f"its edge {axis}" for axis in axes
+        )
+        return f"mount {mount + 1}" + (f" (about {about})" if about else "")
+
     def without(self, dropped: Sequence[DroppedHalfTurn]) -> Session:
         """The same session with the views of these half-turns unseen.
 

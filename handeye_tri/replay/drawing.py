@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.camera import PinholeCamera
-from handeye_tri.mechanism import Mechanism
+from handeye_tri.mechanism import Geometry, Mechanism
 from handeye_tri.records import GroundTruth, HandEyeCalibration
 from handeye_tri.replay.engine import rr, solid, transform
 from handeye_tri.replay.overlay import CORNER
@@ -34,18 +35,54 @@ def body_path(mechanism: Mechanism, body: int) -> str:
 
 
 def log_cell(
-    recording: rr.RecordingStream, mechanism: Mechanism, base_from_world: SE3
+    recording: rr.RecordingStream,
+    mechanisms: Sequence[Mechanism],
+    base_from_world: SE3,
 ) -> None:
-    """The cell's solids, at all times."""
+    """The cell's solids, at all times; where there are several mounts, without them.
+
+    Args:
+        recording: To log to.
+        mechanisms: The cell with each mount.
+        base_from_world: Where the world is, seen from the robot's base.
+    """
     recording.log("cell", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     world_from_base = se3_inverse(base_from_world.matrix)
     recording.log("cell/base", transform(world_from_base), static=True)
     recording.log("track", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for geometry in mechanism.geometries:
-        path = body_path(mechanism, geometry.body)
-        path = f"{path}/{rr.escape_entity_path_part(geometry.name)}"
-        recording.log(path, transform(geometry.body_from_geometry.matrix), static=True)
-        recording.log(path, solid(geometry), static=True)
+    first = mechanisms[0]
+    for geometry in first.geometries:
+        if len(mechanisms) == 1 or geometry.body != first.marker_body:
+            _log_solid(recording, body_path(first, geometry.body), geometry)
+
+
+def log_mount(
+    recording: rr.RecordingStream, mechanisms: Sequence[Mechanism], mount: int
+) -> None:
+    """What holds the triangle from here on, where there are several mounts.
+
+    Args:
+        recording: To log to, at the places of the timelines that are set.
+        mechanisms: The cell with each mount.
+        mount: Which of them, from 0.
+    """
+    for number, mechanism in enumerate(mechanisms):
+        path = f"{body_path(mechanism, mechanism.marker_body)}/mount_{number + 1}"
+        if number != mount:
+            recording.log(path, rr.Clear(recursive=True))
+            continue
+        for geometry in mechanism.geometries:
+            if geometry.body == mechanism.marker_body:
+                _log_solid(recording, path, geometry, static=False)
+
+
+def _log_solid(
+    recording: rr.RecordingStream, body: str, geometry: Geometry, *, static: bool = True
+) -> None:
+    path = f"{body}/{rr.escape_entity_path_part(geometry.name)}"
+    place = transform(geometry.body_from_geometry.matrix)
+    recording.log(path, place, static=static)
+    recording.log(path, solid(geometry), static=static)
 
 
 def log_cameras(

@@ -122,7 +122,7 @@ def write_preview(
     view = next(rendered, None)
     pictured = [False] * len(motion.cameras)
     with recorded(path, name, _layout(motion, base_from_world)) as recording:
-        log_cell(recording, mechanism, base_from_world)
+        log_cell(recording, (mechanism,), base_from_world)
         _log_still(recording, motion, images, arrivals, certificate)
         for k, time in enumerate(motion.times):
             recording.reset_time()

@@ -24,6 +24,7 @@ from handeye_tri.replay.drawing import (
     log_cameras,
     log_cell,
     log_gaps,
+    log_mount,
     log_places,
     log_tracks,
 )
@@ -56,7 +57,7 @@ def write_recording(
     path: Path,
     *,
     name: str,
-    mechanism: Mechanism,
+    mechanisms: Sequence[Mechanism],
     world_from_body: Floats,
     base_from_world: SE3,
     session: Session,
@@ -76,7 +77,7 @@ def write_recording(
     Args:
         path: The file, ``.rrd``.
         name: Names the recording in the viewer.
-        mechanism: The compiled cell.
+        mechanisms: The compiled cell with each mount; their bodies are the same.
         world_from_body: Poses of its bodies at the n stations, (n, bodies, 4, 4), m.
         base_from_world: Where the world is, seen from the robot's base.
         session: What was observed.
@@ -93,7 +94,7 @@ def write_recording(
         InputError: poses, stations and track do not fit each other.
         StorageError: the file cannot be written.
     """
-    n = len(session.stations)
+    n, mechanism = len(session.stations), mechanisms[0]
     if world_from_body.shape != (n, len(mechanism.bodies), 4, 4):
         raise InputError(
             f"world_from_body must have shape ({n}, {len(mechanism.bodies)}, 4, 4) "
@@ -108,7 +109,7 @@ def write_recording(
     look = layout(calibration, story, base_from_world)
     tracked = {int(j): k for k, j in enumerate(np.flatnonzero(story.held_out))}
     with recorded(path, name, look) as recording:
-        log_cell(recording, mechanism, base_from_world)
+        log_cell(recording, mechanisms, base_from_world)
         log_cameras(recording, calibration, story, truth)
         log_tracks(recording, story)
         _log_words(recording, story, track, evaluation)
@@ -123,6 +124,8 @@ def write_recording(
             _at(recording, **place, step=0 if j == story.shown else None)
             for body, pose in enumerate(world_from_body[j][1:], 1):
                 recording.log(body_path(mechanism, body), transform(pose))
+            if len(mechanisms) > 1:
+                log_mount(recording, mechanisms, session.stations[j].mount)
             if story.held_out[j]:
                 recording.log(
                     "error_mm/predicted", rr.Scalars(1e3 * track.predicted_rms)

@@ -67,6 +67,7 @@ class Story:
         observed: Markers where the cameras see them, shape (n, 3, 3), m; NaN =
             seen by fewer than two cameras, or by less than all of the only one.
         actual: Markers where they truly were, (n, 3, 3), m; None without truth.
+        mounts: What the mount that holds the triangle is called, by station.
         predicted: Markers in the images by calibration and robot, their outline's
             centre, shape (m, n, 3, 2), pixels.
         turns: Per camera and station, the half-turn that the station belongs to;
@@ -86,6 +87,7 @@ class Story:
     reported: Floats
     observed: Floats
     actual: Floats | None
+    mounts: tuple[str, ...]
     predicted: Floats
     turns: tuple[tuple[HalfTurnView, ...], ...]
     shown: int
@@ -174,7 +176,8 @@ def tell(
             "the track has stations that this session does not hold out; "
             "evaluate this session first"
         )
-    reported = _move(session.base_from_flange, calibration.markers)
+    mounts = session.mounts
+    reported = _move(session.base_from_flange, calibration.markers_at(mounts))
     observed = np.full((n, 3, 3), np.nan)
     for rows in (used_track(session, calibration), track):
         if rows is not None:
@@ -185,7 +188,8 @@ def tell(
         markers = truth.markers
         if markers is None:
             markers = truth.flange_from_triangle.apply(session.triangle.points)
-        actual = _move(truth.base_from_flange, markers)
+        others = [mount.markers for mount in truth.other_mounts]
+        actual = _move(truth.base_from_flange, np.array([markers, *others])[mounts])
     predicted = predicted_pixels(calibration, session)
     gaps = observed - reported
     shown = _worst_of(gaps, about)
@@ -198,6 +202,7 @@ def tell(
         reported=reported,
         observed=observed,
         actual=actual,
+        mounts=tuple(session.mount_name(mount) for mount in mounts.tolist()),
         predicted=predicted,
         turns=tuple(
             half_turn_views(session, i, camera)
@@ -258,8 +263,8 @@ def _ellipsoids(
 
 
 def _move(base_from_flange: Floats, markers: Floats) -> Floats:
-    """Markers (3, 3) in the flange at poses (n, 4, 4): in the base, (n, 3, 3)."""
-    turned = np.einsum("nab,kb->nka", base_from_flange[:, :3, :3], markers)
+    """Markers (n, 3, 3) in the flange at poses (n, 4, 4): in the base, (n, 3, 3)."""
+    turned = np.einsum("nab,nkb->nka", base_from_flange[:, :3, :3], markers)
     return np.asarray(turned + base_from_flange[:, None, :3, 3])
 
 

@@ -15,6 +15,15 @@ from handeye_tri.triangle import VERTICES
 _LEVELS = {"error": "ERROR", "warning": "WARN", "note": "INFO"}
 
 
+# What half-turns look like in an image, about a normal and about an edge.
+_LINES = (
+    "White lines AA' BB' CC' join a marker before and after the half-turn and meet in "
+    "O.",
+    "A white line joins the marker that moves before (X) and after (X') the half-turn; "
+    "it meets the edge that is the axis in O.",
+)
+
+
 @dataclass(frozen=True, slots=True)
 class LogLine:
     """A line of the recording's log.
@@ -82,6 +91,7 @@ def verdict_markdown(
         f"{met} of {len(ran)} gates met, {len(evaluation['gates']) - len(ran)} not "
         f"run; nearest to failing: {evaluation['nearest']}. {source}.",
         "",
+        *_held(story),
         "---",
         _legend(story),
     ]
@@ -115,6 +125,23 @@ def look_at(story: Story, findings: Sequence[Mapping[str, Any]]) -> str:
     return text
 
 
+def changes_of_mount(story: Story) -> list[tuple[int, str]]:
+    """Stations at which another mount holds the triangle, and what it is called."""
+    mounts = story.mounts
+    return [(j, mounts[j]) for j in range(1, len(mounts)) if mounts[j] != mounts[j - 1]]
+
+
+def _held(story: Story) -> list[str]:
+    """Which stations have which mount, where there are several."""
+    starts = [(0, story.mounts[0]), *changes_of_mount(story)]
+    ends = [*(j for j, _ in starts[1:]), len(story.mounts)]
+    spans = [
+        f"{start}-{end - 1} {name}"
+        for (start, name), end in zip(starts, ends, strict=True)
+    ]
+    return [f"Stations {', '.join(spans)}.", ""] if len(spans) > 1 else []
+
+
 def _unseen(story: Story, j: int) -> str:
     """Why a station has no gap."""
     codes = {check.code for check in story.checks if check.station == j}
@@ -139,15 +166,9 @@ def _findings(findings: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _legend(story: Story) -> str:
     truth = " **Grey**: the truth." if story.actual is not None else ""
-    lines = (
-        "White lines AA' BB' CC' join a marker before and after the half-turn and meet "
-        "in O."
-    )
-    if any(turn.edge is not None for view in story.turns for turn in view):
-        lines = (
-            "A white line joins the marker that moves before (X) and after (X') the "
-            "half-turn; it meets the edge that is the axis in O."
-        )
+    turns = [turn for view in story.turns for turn in view if turn.lines]
+    by_edge = {turn.edge is not None for turn in turns}
+    lines = " ".join(_LINES[edge] for edge in sorted(by_edge))
     return (
         "**Blue**: what was calibrated, and the stations it used. **Orange**: held "
         f"out.{truth}\n\nImages: o where a marker is seen, + where calibration and "
@@ -284,6 +305,8 @@ def log_lines(story: Story, evaluation: Mapping[str, Any]) -> list[LogLine]:
                 f"it is predicted, {check.worst_sigmas:.1f} sigmas"
             )
             lines.append(LogLine(check.station, "WARN", text))
+    for j, now in changes_of_mount(story):
+        lines.append(LogLine(j, "INFO", f"tool change: from here on {now}"))
     for j, held_out in enumerate(story.held_out):
         marker, gap = story.worst(j)
         kind = "held out" if held_out else "used"

@@ -159,6 +159,21 @@ def test_mounts_that_do_not_fit(
         session(stations=on_mounts(*mounts), half_turns=turns)
 
 
+def test_a_mount_is_called_by_what_it_turns_about() -> None:
+    stations = (*on_mounts(0, 0, 1, 1), *(dataclasses.replace(station(4), mount=2),))
+    nothing = {
+        "pixels": np.full((2, 5, 3, 2), np.nan),
+        "pixel_covariance": np.full((2, 5, 3, 2, 2), np.nan),
+    }
+    turns = (HalfTurn(0, 1, "normal"), HalfTurn(2, 3, "BC"))
+    record = session(stations=stations, half_turns=turns, **nothing)
+    assert [record.mount_name(mount) for mount in range(3)] == [
+        "mount 1 (about a normal)",
+        "mount 2 (about its edge BC)",
+        "mount 3",
+    ]
+
+
 def test_a_mount_is_counted_from_zero() -> None:
     with pytest.raises(InputError, match="station 0: mount must be 0 or more, got -1"):
         dataclasses.replace(station(0), mount=-1)

@@ -24,6 +24,8 @@ from handeye_tri.diagnose import Finding
 from handeye_tri.errors import InputError, StorageError
 from handeye_tri.records import TrackEvaluation
 from handeye_tri.replay import SolverStep, write_recording
+from handeye_tri.replay.drawing import log_cell, log_mount
+from handeye_tri.replay.engine import only_views, recorded, rrb
 from handeye_tri.replay.recording import read_numbers
 from handeye_tri.replay.story import tell
 from handeye_tri.se3 import SE3
@@ -33,7 +35,7 @@ def write(path, **changes):
     done = finished()
     arguments = {
         "name": "test 1",
-        "mechanism": mechanism(),
+        "mechanisms": (mechanism(),),
         "world_from_body": world_from_body(done.session),
         "base_from_world": BASE_FROM_WORLD,
         "session": done.session,
@@ -354,3 +356,28 @@ def test_strict_mode_is_left_as_it_was(tmp_path):
     before = rr.strict_mode()
     write(tmp_path / "replay.rrd")
     assert rr.strict_mode() == before
+
+
+def test_each_mount_is_drawn_at_its_own_stations(tmp_path):
+    """Solids of the one are there while those of the other are cleared."""
+    path = tmp_path / "replay.rrd"
+    one = mechanism()
+    fewer = tuple(g for g in one.geometries if g.shape != "ellipsoid")
+    both = (replace(one, marker_body=1), replace(one, marker_body=1, geometries=fewer))
+    with recorded(
+        path, "two mounts", only_views(rrb.Vertical(), rrb.TimePanel())
+    ) as to:
+        log_cell(to, both, BASE_FROM_WORLD)
+        for station, mount in enumerate((0, 0, 1)):
+            to.set_time("station", sequence=station)
+            log_mount(to, both, mount)
+    body = "cell/robot/base"
+    length = "Cylinders3D:lengths"
+    for number, shown, cleared in ((1, [0, 1], [2]), (2, [2], [0, 1])):
+        mount = f"{body}/mount_{number}"
+        solids = column(path, rf"{mount}/cylinder\ of\ 1", length)
+        assert sorted(solids) == shown
+        cleared_at = column(path, mount, "Clear:is_recursive")
+        assert sorted(cleared_at) == cleared
+    # What no mount changes is there at all times.
+    assert list(column(path, r"cell/surroundings/box\ of\ 0", "Boxes3D:half_sizes"))

@@ -37,7 +37,7 @@ def recording(tmp_path_factory):
     write_recording(
         path,
         name="test",
-        mechanism=mechanism(),
+        mechanisms=(mechanism(),),
         world_from_body=world_from_body(done.session),
         base_from_world=BASE_FROM_WORLD,
         session=done.session,
