@@ -71,9 +71,13 @@ def test_the_reported_pose_only_says_which_of_the_poses_is_meant(cell):
     places = session.indices("evaluation")
     reported = session.base_from_flange[places]
     view = session.pixels[0, places], session.pixel_covariance[0, places]
-    first = seen_by_one(found, *view, session.marker_radii, reported)
+    first = seen_by_one(
+        found, *view, session.marker_radii, reported, session.mounts[places]
+    )
     off = reported @ se3_exp(np.array([0.002, -0.001, 0.003, 0.004, 0.003, -0.002]))
-    second = seen_by_one(found, *view, session.marker_radii, off)
+    second = seen_by_one(
+        found, *view, session.marker_radii, off, session.mounts[places]
+    )
     assert len(first.views) == len(places)
     np.testing.assert_allclose(first.points, second.points, atol=1e-10)
 
@@ -84,13 +88,19 @@ def test_derivatives_are_those_of_the_placed_markers(cell):
     reported = session.base_from_flange[places]
     pixels, noise = session.pixels[0, places], session.pixel_covariance[0, places]
     radii = session.marker_radii
-    seen = seen_by_one(found, pixels, noise, radii, reported)
+    mounts = session.mounts[places]
+    seen = seen_by_one(found, pixels, noise, radii, reported, mounts)
     for k in range(6):
         step = np.zeros(6)
         step[k] = 1e-3
         plus, minus = (
             seen_by_one(
-                found, pixels + sign * step.reshape(3, 2), noise, radii, reported
+                found,
+                pixels + sign * step.reshape(3, 2),
+                noise,
+                radii,
+                reported,
+                mounts,
             ).points
             for sign in (1, -1)
         )
@@ -111,7 +121,7 @@ def test_derivatives_are_those_of_the_placed_markers(cell):
         other = replace(
             found, cameras=(camera,), base_from_camera=(place,), markers=markers
         )
-        return seen_by_one(other, pixels, noise, radii, reported).points
+        return seen_by_one(other, pixels, noise, radii, reported, mounts).points
 
     labels = found.covariance.labels
     for label, step in (
@@ -164,7 +174,12 @@ def test_the_map_is_the_mean_of_simulated_views(cell):
             noisy = seen + SIGMA * rng.normal(size=(400, 3, 2))
             noise = np.broadcast_to(SIGMA**2 * np.eye(2), (400, 3, 2, 2))
             points = seen_by_one(
-                found, noisy, noise, np.zeros(3), np.tile(pose, (400, 1, 1))
+                found,
+                noisy,
+                noise,
+                np.zeros(3),
+                np.tile(pose, (400, 1, 1)),
+                np.zeros(400, int),
             ).points
             squares.append(np.square(points[:, k] - point).sum(axis=1).mean())
     assert np.sqrt(np.trace(expected)) == pytest.approx(

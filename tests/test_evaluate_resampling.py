@@ -68,13 +68,13 @@ def test_half_turns_stay_together_and_every_station_is_in_one_fold():
         *((0, 1), (2, 3), (4, 5), (6, 7), (8, 9), (10, 11)),
         *((12, 13, 14), (15,), (18,)),
     ]
-    folds = split(groups, 4, RNG(3))
+    folds = split(groups, session.mounts, 4, RNG(3))
     assert sorted(j for fold in folds for j in fold) == [*range(16), 18]
     assert max(map(len, folds)) <= 7
     for group in groups:
         assert sum(set(group) <= set(fold) for fold in folds) == 1
-    assert folds != split(groups, 4, RNG(4))
-    assert folds == split(groups, 4, RNG(3))
+    assert folds != split(groups, session.mounts, 4, RNG(4))
+    assert folds == split(groups, session.mounts, 4, RNG(3))
 
 
 def test_what_is_held_out_reaches_neither_half_turns_nor_the_test_twice():

@@ -42,7 +42,7 @@ def evo_ape(folder, relation):
 @pytest.mark.parametrize("axis", ["normal", "BC"])
 def test_evo_finds_the_same_track_error(tmp_path, axis):
     done = finished(3, axis)
-    poses = track_poses(done.calibration, done.track)
+    poses = track_poses(done.calibration, done.track, done.session.mounts)
     assert poses.rows.tolist() == list(range(9))
     for name in ("reported", "observed"):
         motions = getattr(poses, name)
@@ -61,7 +61,7 @@ def test_evo_finds_the_same_track_error(tmp_path, axis):
 
 def test_orientations_are_those_of_the_triangle():
     done = finished(3)
-    poses = track_poses(done.calibration, done.track)
+    poses = track_poses(done.calibration, done.track, done.session.mounts)
     session = done.session
     for row, station in enumerate(done.track.stations):
         expected = session.base_from_flange[station, :3, :3]
@@ -75,7 +75,7 @@ def test_orientations_are_those_of_the_triangle():
         *(done.track.stations, done.track.markers, done.track.reported),
         *(observed.reshape(-1, 3), done.track.predicted_covariance),
     )
-    angles = track_poses(done.calibration, moved).rotation_errors
+    angles = track_poses(done.calibration, moved, done.session.mounts).rotation_errors
     np.testing.assert_allclose(angles, np.linalg.norm([0.001, -0.002, 0.0005]))
 
 
@@ -87,7 +87,7 @@ def test_a_station_that_lacks_a_marker_has_no_orientation():
         *(track.stations[keep], track.markers[keep], track.reported[keep]),
         *(track.observed[keep], track.predicted_covariance[keep]),
     )
-    poses = track_poses(done.calibration, partial)
+    poses = track_poses(done.calibration, partial, done.session.mounts)
     assert poses.rows.tolist() == [0, 1, 2, 5, 6, 7]
     assert len(poses.rotation_errors) == 2
     assert (np.diff(poses.times) > 0).all()
@@ -95,7 +95,7 @@ def test_a_station_that_lacks_a_marker_has_no_orientation():
 
 def test_files_read_back_to_the_same_bits(tmp_path):
     done = finished(3)
-    poses = track_poses(done.calibration, done.track)
+    poses = track_poses(done.calibration, done.track, done.session.mounts)
     path = tmp_path / "track.tum"
     write_tum(path, poses.times, poses.observed, "what it is")
     assert path.read_text().startswith("# what it is\n# t x y z qx qy qz qw\n")

@@ -10,7 +10,8 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.records import MARKER_LABELS, HandEyeCalibration, motion_labels
+from handeye_tri.evaluate.derivatives import rig_labels
+from handeye_tri.records import HandEyeCalibration, motion_labels
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +29,8 @@ class TrackBudget:
         robot: From the robot's repeatability at the held-out stations.
         calibration_parts: The calibration's part split further, by name: each camera
             ("<camera> camera"; "cameras" where there are more than four), "stereo",
-            "hand-eye", "rig", "robot parameters". Their squares add up to its square.
+            "hand-eye", "rig" ("rig, mount 1" ... where there are several mounts),
+            "robot parameters". Their squares add up to its square.
     """
 
     calibration: float
@@ -129,10 +131,11 @@ def _parameters(calibration: HandEyeCalibration) -> tuple[list[str], Floats]:
         change.append(rows(motion_labels(f"base_from_{name}")) - back @ first)
     owners += ["hand-eye"] * 6
     change.append(first)
-    free = set(MARKER_LABELS) <= set(labels)
-    rig = MARKER_LABELS if free else motion_labels("flange_from_triangle")
-    owners += ["rig"] * len(rig)
-    change.append(rows(rig))
+    mounts = len(calibration.mounts)
+    for mount in range(mounts):
+        rig = rig_labels(calibration, mount)
+        owners += ["rig" if mounts == 1 else f"rig, mount {mount + 1}"] * len(rig)
+        change.append(rows(rig))
     owners += ["robot parameters"] * len(calibration.robot)
     change.append(rows(tuple(calibration.robot)))
     return owners, np.concatenate(change)

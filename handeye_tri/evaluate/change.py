@@ -12,14 +12,9 @@ from scipy import stats
 
 from handeye_tri.camera import triangulate
 from handeye_tri.errors import InputError
-from handeye_tri.evaluate.derivatives import observed_by_parameters
+from handeye_tri.evaluate.derivatives import observed_by_parameters, rig_labels
 from handeye_tri.evaluate.truth import compare_with_truth
-from handeye_tri.records import (
-    MARKER_LABELS,
-    GroundTruth,
-    HandEyeCalibration,
-    motion_labels,
-)
+from handeye_tri.records import GroundTruth, HandEyeCalibration, motion_labels
 
 Floats = NDArray[np.float64]
 Part = Literal["intrinsics", "place", "between", "rig"]
@@ -44,6 +39,7 @@ class PartChange:
         dof: Degrees of freedom of chi2.
         p_value: How often noise alone changes it as much.
         changed: Whether that is too seldom, all parts taken together.
+        mount: Of a rig that has several mounts, on which, from 0; else -1.
     """
 
     part: Part
@@ -54,6 +50,7 @@ class PartChange:
     dof: int
     p_value: float
     changed: bool
+    mount: int = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +78,7 @@ def as_reference(calibration: HandEyeCalibration) -> GroundTruth:
         calibration.flange_from_triangle,
         np.empty((0, 4, 4)),
         calibration.markers,
+        calibration.other_mounts,
     )
 
 
@@ -102,6 +100,12 @@ def part_changes(
         InputError: they do not have the same unknowns.
     """
     labels = before.covariance.labels
+    mounts = [len(one.mounts) for one in (before, after)]
+    if mounts[0] != mounts[1]:
+        raise InputError(
+            f"before there {_mounts(mounts[0])} of the rig, after there "
+            f"{_mounts(mounts[1])}; compare sessions with the same mounts"
+        )
     if set(labels) != set(after.covariance.labels):
         odd = sorted(set(labels) ^ set(after.covariance.labels))
         raise InputError(
@@ -114,7 +118,8 @@ def part_changes(
     }
     covariance = before.covariance.matrix + after.covariance.block(labels)
     tested: list[tuple[Part, str, float, float, float, int, float]] = []
-    for part, camera, names in _parts(before):
+    parts = _parts(before)
+    for part, camera, mount, names in parts:
         rows = [labels.index(name) for name in names]
         step = np.array([change[name] for name in names])
         chi2, dof = _mahalanobis(step, covariance[np.ix_(rows, rows)])
@@ -123,14 +128,20 @@ def part_changes(
             moved = float(np.linalg.norm(step[:3]))
             turned = float(np.linalg.norm(step[3:]))
         elif part == "rig":
-            gaps = np.linalg.norm(after.markers - before.markers, axis=1)
+            markers = [one.mounts[max(mount, 0)].markers for one in (before, after)]
+            gaps = np.linalg.norm(markers[1] - markers[0], axis=1)
             moved = float(np.sqrt((gaps**2).mean()))
         p_value = float(stats.chi2.sf(chi2, dof)) if dof else 1.0
         tested.append((part, camera, moved, turned, chi2, dof, p_value))
     changed = _holm([row[-1] for row in tested])
     return tuple(
-        PartChange(*row, changed=one) for row, one in zip(tested, changed, strict=True)
+        PartChange(*row, changed=one, mount=mount)
+        for row, one, (_, _, mount, _) in zip(tested, changed, parts, strict=True)
     )
+
+
+def _mounts(count: int) -> str:
+    return "is 1 mount" if count == 1 else f"are {count} mounts"
 
 
 def placement_change(
@@ -176,20 +187,22 @@ def placement_change(
 
 def _parts(
     calibration: HandEyeCalibration,
-) -> list[tuple[Part, str, tuple[str, ...]]]:
-    """Every part of a cell with the labels of its quantities."""
+) -> list[tuple[Part, str, int, tuple[str, ...]]]:
+    """Every part of a cell: camera, mount, and the labels of its quantities."""
     labels = calibration.covariance.labels
-    parts: list[tuple[Part, str, tuple[str, ...]]] = []
+    parts: list[tuple[Part, str, int, tuple[str, ...]]] = []
     names = [camera.name for camera in calibration.cameras]
     for name in names:
         own = tuple(label for label in labels if label.rsplit(".", 1)[0] == name)
-        parts.append(("intrinsics", name, own))
-    parts += [("place", name, motion_labels(f"base_from_{name}")) for name in names]
+        parts.append(("intrinsics", name, -1, own))
+    parts += [("place", name, -1, motion_labels(f"base_from_{name}")) for name in names]
     for name in names[1:]:
-        parts.append(("between", name, motion_labels(f"reference_from_{name}")))
-    free = set(MARKER_LABELS) <= set(labels)
-    rig = MARKER_LABELS if free else motion_labels("flange_from_triangle")
-    return [*parts, ("rig", "", rig)]
+        parts.append(("between", name, -1, motion_labels(f"reference_from_{name}")))
+    count = len(calibration.mounts)
+    for mount in range(count):
+        own = rig_labels(calibration, mount)
+        parts.append(("rig", "", mount if count > 1 else -1, own))
+    return parts
 
 
 def _mahalanobis(step: Floats, covariance: Floats) -> tuple[float, int]:

@@ -17,7 +17,7 @@ from handeye_tri.evaluate.resampling import (
     station_groups,
 )
 from handeye_tri.evaluate.track import evaluate_track, track_budget
-from handeye_tri.records import Session, TrackEvaluation
+from handeye_tri.records import HandEyeCalibration, Session, TrackEvaluation
 
 # Up to so many groups each is left out alone; beyond, there are so many folds.
 _LEAVE_ONE_OUT = 20
@@ -84,17 +84,15 @@ def cross_validate(
             f"{len(groups)} half-turns or lone stations, got {folds}"
         )
     rng = np.random.default_rng(0) if rng is None else rng
-    every = np.arange(len(session.stations))
     done: list[tuple[int, ...]] = []
     undetermined: list[tuple[int, ...]] = []
     tracks: list[TrackEvaluation] = []
     budgets: list[TrackBudget] = []
-    parts = split(groups, folds, rng)
+    parts = split(groups, session.mounts, folds, rng)
     for number, fold in enumerate(parts, 1):
         part = held_out(session, fold)
-        try:
-            calibration = recalibrate(part, every)
-        except (DegenerateMotionError, ConvergenceError):
+        calibration = _calibrated(part, recalibrate)
+        if calibration is None:
             undetermined.append(fold)
         else:
             tracks.append(evaluate_track(calibration, part, robot_parameters))
@@ -110,6 +108,17 @@ def cross_validate(
     return CrossValidation(
         _joined(tracks), tuple(done), tuple(undetermined), _mean_budget(tracks, budgets)
     )
+
+
+def _calibrated(part: Session, recalibrate: Recalibrate) -> HandEyeCalibration | None:
+    """None where the stations that are left do not determine the cell."""
+    left = part.mounts[part.indices("calibration")]
+    if set(left.tolist()) != set(part.mounts.tolist()):
+        return None
+    try:
+        return recalibrate(part, np.arange(len(part.stations)))
+    except (DegenerateMotionError, ConvergenceError):
+        return None
 
 
 def _joined(tracks: list[TrackEvaluation]) -> TrackEvaluation:

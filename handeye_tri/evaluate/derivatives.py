@@ -6,34 +6,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.hand_eye.camera_parameters import project_with_parameters
-from handeye_tri.records import MARKER_LABELS, HandEyeCalibration, motion_labels
+from handeye_tri.records import (
+    HandEyeCalibration,
+    marker_labels,
+    motion_labels,
+    triangle_name,
+)
 from handeye_tri.se3 import hat
 
 Floats = NDArray[np.float64]
 
 
 def by_tangent(points: Floats) -> Floats:
-    """Derivative of exp(d) X by d at 0, shape (r, 3, 6), of points (r, 3)."""
-    eye = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    """Derivative of exp(d) X by d at 0, shape (..., 3, 6), of points (..., 3)."""
+    eye = np.broadcast_to(np.eye(3), (*points.shape, 3))
     return np.concatenate([eye, -hat(points)], axis=-1)
 
 
-def markers_by_parameters(calibration: HandEyeCalibration) -> Floats:
-    """Derivative of A, B, C in the flange by the labelled parameters, (3, 3, p).
+def rig_labels(calibration: HandEyeCalibration, mount: int) -> tuple[str, ...]:
+    """Labels of the parameters that place the markers of a mount, from 0.
 
-    By the markers themselves where the calibration estimated them, else by the
-    motion of the rigid triangle.
+    The markers themselves where the calibration estimated them, else the motion of the
+    rigid triangle.
+    """
+    free = marker_labels(mount)
+    if set(free) <= set(calibration.covariance.labels):
+        return free
+    return motion_labels(triangle_name(mount))
+
+
+def markers_by_parameters(calibration: HandEyeCalibration) -> Floats:
+    """Derivative of A, B, C in the flange by the labelled parameters.
+
+    Returns:
+        Shape (k, 3, 3, p) for k mounts; see :func:`rig_labels`.
     """
     labels = calibration.covariance.labels
-    result = np.zeros((3, 3, len(labels)))
-    if set(MARKER_LABELS) <= set(labels):
-        columns = [labels.index(name) for name in MARKER_LABELS]
-        result[..., columns] = np.eye(9).reshape(3, 3, 9)
-        return result
-    columns = [labels.index(name) for name in motion_labels("flange_from_triangle")]
-    frame = calibration.flange_from_triangle
-    points = frame.inverse().apply(calibration.markers)
-    result[..., columns] = frame.rotation @ by_tangent(points)
+    result = np.zeros((len(calibration.mounts), 3, 3, len(labels)))
+    for number, mount in enumerate(calibration.mounts):
+        names = rig_labels(calibration, number)
+        columns = [labels.index(name) for name in names]
+        if names == marker_labels(number):
+            result[number][..., columns] = np.eye(9).reshape(3, 3, 9)
+        else:
+            frame = mount.flange_from_triangle
+            points = frame.inverse().apply(mount.markers)
+            result[number][..., columns] = frame.rotation @ by_tangent(points)
     return result
 
 

@@ -97,18 +97,32 @@ def bootstrap(
         progress: Told after each.
 
     Raises:
-        InputError: fewer than three half-turns or lone stations, or too few replicates
-            determined the cell.
+        InputError: fewer than three half-turns or lone stations, fewer than two with
+            one of several mounts, or too few replicates determined the cell.
     """
     groups = station_groups(session)
     if len(groups) < 3:
         raise InputError(
             f"repeatability needs 3 half-turns or lone stations, got {len(groups)}"
         )
+    by_mount: dict[int, list[tuple[int, ...]]] = {}
+    for group in groups:
+        by_mount.setdefault(session.stations[group[0]].mount, []).append(group)
+    for mount, own in by_mount.items():
+        if len(own) < 2:
+            raise InputError(
+                f"repeatability needs 2 half-turns or lone stations with each mount, "
+                f"got 1 with mount {mount + 1}"
+            )
 
     def draw() -> tuple[Session, NDArray[np.intp]]:
-        chosen = rng.choice(len(groups), _DRAWN * len(groups))
-        return drawn(session, [groups[k] for k in chosen])
+        # As many with each mount as there are: a programme fixes their number.
+        chosen = [
+            own[k]
+            for own in by_mount.values()
+            for k in rng.choice(len(own), _DRAWN * len(own))
+        ]
+        return drawn(session, chosen)
 
     spread = _spread(calibration, draw, recalibrate, replicates, len(groups), progress)
     covariance = spread.covariance

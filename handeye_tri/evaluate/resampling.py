@@ -34,13 +34,21 @@ def station_groups(session: Session) -> list[tuple[int, ...]]:
 
 
 def split(
-    groups: Sequence[tuple[int, ...]], folds: int, rng: np.random.Generator
+    groups: Sequence[tuple[int, ...]],
+    mounts: Indices,
+    folds: int,
+    rng: np.random.Generator,
 ) -> list[tuple[int, ...]]:
     """Deal shuffled groups into folds of nearly equal numbers of groups.
 
+    Mount by mount, so that no fold takes all groups of a mount but one that has a
+    single group.
+
     Args:
         groups: What must stay together.
-        folds: How many folds; with as many as groups, each group is one, in order.
+        mounts: Which mount each station has, shape (n,).
+        folds: How many folds, 2 or more; with as many as groups, each group is one,
+            in order.
         rng: Shuffles.
 
     Returns:
@@ -49,6 +57,7 @@ def split(
     if folds >= len(groups):
         return list(groups)
     order = rng.permutation(len(groups))
+    order = order[np.argsort([mounts[groups[k][0]] for k in order], kind="stable")]
     return [
         tuple(sorted(j for k in order[start::folds] for j in groups[k]))
         for start in range(folds)

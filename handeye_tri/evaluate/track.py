@@ -12,6 +12,7 @@ from handeye_tri import arguments
 from handeye_tri.adjustment import RobotParameters
 from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
 from handeye_tri.camera import triangulate
+from handeye_tri.counting import counted
 from handeye_tri.errors import InputError
 from handeye_tri.evaluate.budget import TrackBudget, calibration_parts
 from handeye_tri.evaluate.derivatives import (
@@ -121,7 +122,7 @@ def evaluate_track(
             corrected by them.
 
     Raises:
-        InputError: the cameras do not fit, nothing was seen by two of them (or by
+        InputError: cameras or mounts do not fit, nothing was seen by two of them (or by
             the only one), or robot_parameters are missing.
     """
     return _evaluate(calibration, session, robot_parameters).track
@@ -197,6 +198,12 @@ def _evaluate(
             f"the calibration has cameras ({', '.join(names)}), the session "
             f"({', '.join(expected)}); evaluate with the session it was made from"
         )
+    if session.mounts.max(initial=0) >= len(calibration.mounts):
+        raise InputError(
+            f"the session has stations with mount {session.mounts.max() + 1} of the "
+            f"rig, the calibration knows {counted(len(calibration.mounts), 'mount')}; "
+            "evaluate with the session it was made from"
+        )
     poses, by_robot = _reported_poses(calibration, session, robot_parameters)
     observed = (
         _triangulated(calibration, session)
@@ -204,12 +211,12 @@ def _evaluate(
         else _from_one_view(calibration, session, poses)
     )
     station, marker = observed.station, observed.marker
-    rotation = poses[station, :3, :3]
-    markers = calibration.markers[marker]
+    rotation, mount = poses[station, :3, :3], session.mounts[station]
+    markers = calibration.markers_at(mount)[np.arange(len(marker)), marker]
     reported = np.einsum("rab,rb->ra", rotation, markers) + poses[station, :3, 3]
     moved = rotation @ by_tangent(markers)
     by_parameters = observed.by_parameters
-    by_parameters -= rotation @ markers_by_parameters(calibration)[marker]
+    by_parameters -= rotation @ markers_by_parameters(calibration)[mount, marker]
     by_parameters -= moved @ by_robot[station]
     parts = np.stack(
         [
@@ -270,6 +277,7 @@ def _from_one_view(
         session.pixel_covariance[0, stations],
         session.marker_radii,
         poses[stations],
+        session.mounts[stations],
     )
     s, p = len(found.views), found.by_parameters.shape[-1]
     seen = np.zeros((3 * s, 3, 9))

@@ -38,12 +38,21 @@ class TrackPoses:
         return np.asarray(np.linalg.norm(so3_log(turn), axis=-1))
 
 
-def track_poses(calibration: HandEyeCalibration, track: TrackEvaluation) -> TrackPoses:
+def track_poses(
+    calibration: HandEyeCalibration,
+    track: TrackEvaluation,
+    mounts: NDArray[np.intp],
+) -> TrackPoses:
     """Both tracks as poses.
 
     The observed orientation is that which turns the calibrated markers onto the
     observed ones with the least squares of distances (Kabsch 1976,
     doi:10.1107/S0567739476001873).
+
+    Args:
+        calibration: Has the markers on the flange.
+        track: Both tracks.
+        mounts: Which mount holds them at each station of the session, shape (n,).
     """
     complete = [
         j for j in np.unique(track.stations) if (track.stations == j).sum() == 3
@@ -54,7 +63,8 @@ def track_poses(calibration: HandEyeCalibration, track: TrackEvaluation) -> Trac
     reported = np.tile(np.eye(4), (len(rows), 1, 1))
     observed = reported.copy()
     reported[:, :3, 3], observed[:, :3, 3] = track.reported[rows], track.observed[rows]
-    shape = calibration.markers - calibration.markers.mean(axis=0)
+    carried = calibration.markers_at(mounts[stations[::3]])
+    shape = carried - carried.mean(axis=1, keepdims=True)
     for poses in (reported, observed):
         seen = poses[:, :3, 3].reshape(count, 3, 3)
         seen = seen - seen.mean(axis=1, keepdims=True)

@@ -8,12 +8,14 @@ import numpy as np
 
 from handeye_tri.errors import InputError
 from handeye_tri.records import (
-    MARKER_LABELS,
     MOTION_QUANTITIES,
     CameraCalibration,
     GroundTruth,
     HandEyeCalibration,
+    Mount,
+    marker_labels,
     motion_labels,
+    triangle_name,
 )
 from handeye_tri.se3 import SE3, so3_log
 
@@ -66,7 +68,8 @@ def compare_with_truth(
         )
     if isinstance(calibration, HandEyeCalibration):
         estimated = _motions(names, calibration.base_from_camera)
-        estimated["flange_from_triangle"] = calibration.flange_from_triangle
+        for number, mount in enumerate(calibration.mounts):
+            estimated[triangle_name(number)] = mount.flange_from_triangle
     else:
         estimated = {
             f"reference_from_{name}": motion
@@ -75,7 +78,9 @@ def compare_with_truth(
             )
         }
     true = _motions(names, truth.base_from_camera)
-    true["flange_from_triangle"] = truth.flange_from_triangle
+    true[triangle_name()] = truth.flange_from_triangle
+    for number, mount in enumerate(truth.other_mounts, 1):
+        true[triangle_name(number)] = mount.flange_from_triangle
     markers = _markers(calibration, truth)
     rows = []
     for label in calibration.covariance.labels:
@@ -108,12 +113,15 @@ def _markers(
     """Estimate and truth of each marker coordinate, where both are known."""
     if truth.markers is None or not isinstance(calibration, HandEyeCalibration):
         return {}
-    both = zip(
-        calibration.markers.ravel().tolist(),
-        truth.markers.ravel().tolist(),
-        strict=True,
-    )
-    return dict(zip(MARKER_LABELS, both, strict=True))
+    true = (Mount(truth.flange_from_triangle, truth.markers), *truth.other_mounts)
+    values: dict[str, tuple[float, float]] = {}
+    # What has a mount more is not compared there.
+    for number, (one, other) in enumerate(zip(calibration.mounts, true, strict=False)):
+        both = zip(
+            one.markers.ravel().tolist(), other.markers.ravel().tolist(), strict=True
+        )
+        values |= zip(marker_labels(number), both, strict=True)
+    return values
 
 
 def _motions(

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
+from handeye_tri.evaluate.derivatives import by_tangent
 from handeye_tri.records import DroppedHalfTurn, HandEyeCalibration, Session
-from handeye_tri.se3 import hat
 from handeye_tri.triangle import VERTICES
 
 Floats = NDArray[np.float64]
@@ -127,7 +127,8 @@ def check_views(
 def _reported(calibration: HandEyeCalibration, session: Session) -> Floats:
     """Markers where the robot says that they are, shape (n, 3, 3), base, metres."""
     poses = session.base_from_flange
-    turned = np.einsum("nab,kb->nka", poses[:, :3, :3], calibration.markers)
+    markers = calibration.markers_at(session.mounts)
+    turned = np.einsum("nab,nkb->nka", poses[:, :3, :3], markers)
     return np.asarray(turned + poses[:, None, :3, 3])
 
 
@@ -135,14 +136,12 @@ def _by_robot(calibration: HandEyeCalibration, session: Session) -> Floats:
     """Covariance of each projection by the repeatability, (m, n, 3, 2, 2), px^2."""
     points = _reported(calibration, session)
     rotation = session.base_from_flange[:, None, :3, :3]
-    eye = np.broadcast_to(np.eye(3), (3, 3, 3))
-    # A marker X moves by d_t - X x d_r in the flange.
-    by_tangent = rotation @ np.concatenate([eye, -hat(calibration.markers)], axis=-1)
+    moved = rotation @ by_tangent(calibration.markers_at(session.mounts))
     views = []
     for camera, motion in zip(
         calibration.cameras, calibration.base_from_camera, strict=True
     ):
         _, by_point, _, _ = camera.project_jacobians(motion.inverse().apply(points))
-        slope = by_point @ motion.rotation.T @ by_tangent
+        slope = by_point @ motion.rotation.T @ moved
         views.append(slope @ session.repeatability.covariance @ slope.mT)
     return np.array(views)

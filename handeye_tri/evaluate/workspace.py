@@ -47,6 +47,7 @@ def predicted_track_error(
     *,
     sigma_px: float = 0.0,
     repeatability: Repeatability | None = None,
+    mount: int = 0,
 ) -> Floats:
     """Covariance of a marker's observed less reported position anywhere.
 
@@ -62,6 +63,7 @@ def predicted_track_error(
         orientations: Rotations base_from_flange, equally likely, shape (q, 3, 3).
         sigma_px: Noise of the views there, px; 0 for the calibration's part alone.
         repeatability: The robot's; None for the calibration's part alone.
+        mount: Which mount holds the triangle, from 0.
 
     Returns:
         Shape (..., 3, 3), m^2; NaN where the point is in fewer than two images, or a
@@ -80,7 +82,7 @@ def predicted_track_error(
         )
     flat = where.reshape(-1, 3)
     if len(calibration.cameras) == 1:
-        result = _by_one_view(calibration, flat, turns, sigma_px, repeatability)
+        result = _by_one_view(calibration, flat, turns, sigma_px, repeatability, mount)
         return result.reshape(*where.shape, 3)
     pixels = np.full((len(calibration.cameras), len(flat), 2), np.nan)
     for i, camera in enumerate(calibration.cameras):
@@ -99,7 +101,7 @@ def predicted_track_error(
         observed = observed_by_parameters(calibration, flat[rows], unit, noise)
         matrix = calibration.covariance.matrix
         # Reported is R_j p_k: its first and second moments over j and k are enough.
-        reported = turns[:, None] @ markers_by_parameters(calibration)
+        reported = turns[:, None] @ markers_by_parameters(calibration)[mount]
         mean = reported.mean(axis=(0, 1))
         cross = observed @ matrix @ mean.T
         result[rows] = (
@@ -110,7 +112,7 @@ def predicted_track_error(
             + sigma_px**2 * unit
         )
         if repeatability is not None:
-            moved = turns[:, None] @ by_tangent(calibration.markers)
+            moved = turns[:, None] @ by_tangent(calibration.mounts[mount].markers)
             spread = moved @ repeatability.covariance @ moved.mT
             result[rows] += spread.mean(axis=(0, 1))
     return result.reshape(*where.shape, 3)
@@ -122,18 +124,21 @@ def _by_one_view(
     turns: Floats,
     sigma_px: float,
     repeatability: Repeatability | None,
+    mount: int,
 ) -> Floats:
     """The same before a single camera, at points (k, 3): shape (k, 3, 3), m^2."""
     matrix = calibration.covariance.matrix
     total, count = np.zeros((len(points), 3, 3)), np.zeros(len(points))
-    by_markers = markers_by_parameters(calibration)
-    by_error = by_tangent(calibration.markers)
+    markers = calibration.mounts[mount].markers
+    by_markers = markers_by_parameters(calibration)[mount]
+    by_error = by_tangent(markers)
+    held = np.full(len(points), mount)
     for turn in turns:
-        for k, marker in enumerate(calibration.markers):
+        for k, marker in enumerate(markers):
             poses = np.tile(np.eye(4), (len(points), 1, 1))
             poses[:, :3, :3], poses[:, :3, 3] = turn, points - turn @ marker
-            rows = np.flatnonzero(fixed_by_view(calibration, poses))
-            seen, by_pixels = markers_by_view(calibration, poses[rows])
+            rows = np.flatnonzero(fixed_by_view(calibration, poses, held))
+            seen, by_pixels = markers_by_view(calibration, poses[rows], held[rows])
             caused = seen[:, k] - turn @ by_markers[k]
             total[rows] += caused @ matrix @ caused.mT
             total[rows] += sigma_px**2 * by_pixels[:, k] @ by_pixels[:, k].mT
@@ -151,7 +156,9 @@ def track_map(
     """Predicted track error over the box in which the session's markers were.
 
     With the noise of the session's detections (its median) and robot, and with the
-    orientations that its stations had.
+    orientations that its stations had. With several mounts it is the mean of theirs,
+    each at the orientations of its own stations; where only some of them can be
+    placed, of those.
 
     Args:
         calibration: The cell.
@@ -166,16 +173,26 @@ def track_map(
     variance = np.diagonal(session.pixel_covariance, axis1=-2, axis2=-1)
     if not np.isfinite(variance).any():
         raise InputError("the session has no detected marker; there is no noise to map")
-    poses = session.base_from_flange
-    markers = calibration.markers @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
+    poses, mounts = session.base_from_flange, session.mounts
+    markers = calibration.markers_at(mounts) @ poses[:, :3, :3].mT
+    markers += poses[:, None, :3, 3]
     low, high = markers.min(axis=(0, 1)), markers.max(axis=(0, 1))
     axes = [np.linspace(low[k], high[k], shape[k]) for k in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    covariance = predicted_track_error(
-        calibration,
-        points,
-        poses[:, :3, :3],
-        sigma_px=float(np.sqrt(np.nanmedian(variance))),
-        repeatability=session.repeatability,
+    by_mount = np.array(
+        [
+            predicted_track_error(
+                calibration,
+                points,
+                poses[mounts == mount, :3, :3],
+                sigma_px=float(np.sqrt(np.nanmedian(variance))),
+                repeatability=session.repeatability,
+                mount=mount,
+            )
+            for mount in np.unique(mounts).tolist()
+        ]
     )
-    return TrackMap(points, covariance)
+    placed = np.isfinite(by_mount).all(axis=(-2, -1), keepdims=True)
+    with np.errstate(invalid="ignore"):
+        mean = np.where(placed, by_mount, 0.0).sum(axis=0) / placed.sum(axis=0)
+    return TrackMap(points, mean)

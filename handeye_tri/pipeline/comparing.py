@@ -95,8 +95,13 @@ def part_name(change: PartChange) -> str:
         "intrinsics": f"{change.camera} intrinsics",
         "place": f"{change.camera} in base",
         "between": f"{change.camera} to first camera",
-        "rig": "rig on flange",
+        "rig": f"rig on flange{_on_mount(change)}",
     }[change.part]
+
+
+def _on_mount(change: PartChange) -> str:
+    """Which mount, where there are several; "" where there is one."""
+    return f", mount {change.mount + 1}" if change.mount >= 0 else ""
 
 
 def _differences(before: Run, after: Run) -> list[str]:
@@ -113,10 +118,21 @@ def _differences(before: Run, after: Run) -> list[str]:
     ]
     if cameras[0] != cameras[1]:
         found.append(f"cameras {cameras[0]} against {cameras[1]}")
-    rigs = [run.cell.rig.model_dump(mode="json") for run in (before, after)]
-    odd = [key for key in rigs[0] if rigs[0][key] != rigs[1].get(key)]
-    if odd:
-        found.append(f"rig.{odd[0]} {rigs[0][odd[0]]} against {rigs[1].get(odd[0])}")
+    cells = [run.cell.model_dump(mode="json") for run in (before, after)]
+    for name in ("rig", "second_mount"):
+        held = [cell[name] for cell in cells]
+        if (held[0] is None) != (held[1] is None):
+            which = [run for run, one in zip((before, after), held, strict=True) if one]
+            found.append(
+                f"only {which[0].folder.path} has a second mount of its rig (about "
+                f"{which[0].cell.axes[1]})"
+            )
+        elif held[0] is not None:
+            odd = [key for key in held[0] if held[0][key] != held[1].get(key)]
+            found += [
+                f"{name}.{key} {held[0][key]} against {held[1].get(key)}"
+                for key in odd[:1]
+            ]
     if before.robot_errors != after.robot_errors:
         asked = [", ".join(run.robot_errors) or "none" for run in (before, after)]
         found.append(f"errors of the robot estimated: {asked[0]} against {asked[1]}")
@@ -170,11 +186,18 @@ def _sentence(verdict: str, changed: Sequence[PartChange], why: Sequence[str]) -
         if change.part == "intrinsics":
             said.append(f"the intrinsics of camera {change.camera} changed")
         elif change.part == "rig":
-            said.append(f"the rig moved on the flange by {1e3 * change.moved:.2g} mm")
+            said.append(_rig_moved(change))
         elif change.part == "between" and not moved:
             said.append(f"against the first camera, {_how_far(change)}")
     text = "; ".join(said)
     return text[0].upper() + text[1:]
+
+
+def _rig_moved(change: PartChange) -> str:
+    distance = f"{1e3 * change.moved:.2g} mm"
+    if change.mount < 0:
+        return f"the rig moved on the flange by {distance}"
+    return f"the rig has slipped on mount {change.mount + 1} by {distance}"
 
 
 def _how_far(change: PartChange) -> str:

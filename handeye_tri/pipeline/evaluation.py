@@ -162,7 +162,7 @@ def evaluate(run: Run) -> tuple[list[str], str]:
     verdict = judge_session(run, judged)
     truth = run.truth()
     rows = compare_with_truth(hand_eye, truth[0]) if truth else ()
-    poses = track_poses(hand_eye, judged.track)
+    poses = track_poses(hand_eye, judged.track, session.mounts)
     for name, who, motions in zip(
         TRACKS,
         ("as the robot reports it", "as the cameras observe it"),
