@@ -227,6 +227,12 @@ class CellToCalibrate(Model):
         second = () if self.second_mount is None else (self.second_mount.axis,)
         return (self.rig.axis, *second)
 
+    def mount_name(self, mount: int) -> str:
+        """What a person calls a mount (from 0): by its number and its half-turns."""
+        axis = self.axes[mount]
+        about = "a normal" if axis == "normal" else f"its edge {axis}"
+        return f"mount {mount + 1} (about {about})"
+
     @property
     def repeatability(self) -> Repeatability:
         """The robot's stated repeatability in metres and radians."""

@@ -14,10 +14,11 @@ from handeye_tri.counting import counted
 from handeye_tri.plan.design import Design
 from handeye_tri.plan.information import StationInformation
 from handeye_tri.plan.poses import HALF_TURN, View, plane_angles
-from handeye_tri.records import motion_labels
+from handeye_tri.records import motion_labels, triangle_name
 from handeye_tri.se3 import so3_log
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
 Outcome = Literal["PASS", "FAIL", "CANNOT TELL"]
 
 # Least spread of the rotation axes between stations over 3-D: the smallest over the
@@ -60,7 +61,8 @@ def certify(
     model: StationInformation,
     base_from_flange: Floats,
     seen: NDArray[np.bool_],
-    turns: NDArray[np.intp],
+    mounts: Ints,
+    turns: Ints,
 ) -> Certificate:
     """Predict a calibration from its stations.
 
@@ -76,8 +78,10 @@ def certify(
     * ``sigma.<camera>.fx_px`` (``fy_px skew_px cx_px cy_px``, lens by name),
       ``sigma.baseline_mm`` (of the first two cameras),
       ``sigma.base_from_<camera>.translation_mm`` and ``.rotation_deg``, and the same of
-      ``flange_from_triangle``: predicted standard deviations (for motions: of the
-      three axes together),
+      ``flange_from_triangle``, of a second mount ``flange_from_triangle_2``:
+      predicted standard deviations (for motions: of the three axes together),
+    * ``mount_<k>.stations``, ``mount_<k>.half_turns``: how many have mount k, from 1,
+      of a cell with two,
     * ``alone.<camera>.fx_px``: predicted standard deviation of a camera's focal length
       from its own half-turns, with which a calibration begins,
     * ``track_calibration_rms_mm``: the calibration's part of the predicted distance
@@ -90,14 +94,17 @@ def certify(
         model: Predicts what stations tell.
         base_from_flange: Calibration stations, shape (n, 4, 4), metres.
         seen: Which cameras see all markers there, shape (n, m).
+        mounts: Which mount holds the triangle there, shape (n,).
         turns: Stations before and after each half-turn, shape (k, 2).
     """
-    information = model.of_stations(base_from_flange, seen).sum(axis=0)
+    information = model.of_stations(base_from_flange, seen, mounts).sum(axis=0)
     values, vectors = _scaled_spectrum(information)
     covariance = model.covariance(information)
     numbers = {
         "sigma_px": model.sigma_px,
-        "plane_spread_deg": plane_spread_deg(model, base_from_flange[turns[:, 0]]),
+        "plane_spread_deg": plane_spread_deg(
+            model, base_from_flange[turns[:, 0]], mounts[turns[:, 0]]
+        ),
         "axis_spread": axis_spread(base_from_flange[:, :3, :3]),
         "rank": float((values > _NO_INFORMATION).sum()),
         "unknowns": float(len(values)),
@@ -112,12 +119,16 @@ def certify(
     for camera in cell.cameras:
         name = f"base_from_{camera.name}"
         numbers |= _of_motion(name, covariance.block(motion_labels(name)))
-    rig = model.rig_covariance(covariance)
-    numbers |= _of_motion("flange_from_triangle", rig)
+    for mount in range(len(model.views)):
+        rig = model.rig_covariance(covariance, mount)
+        numbers |= _of_motion(triangle_name(mount), rig)
+    numbers |= _by_mount(model, mounts, turns)
     if len(cell.cameras) > 1:
         numbers["sigma.baseline_mm"] = 1e3 * model.baseline_sigma(covariance)
     whole = np.asarray(seen[turns].all(axis=1))
-    alone = model.focal_sigmas_alone(base_from_flange[turns], whole)
+    alone = model.focal_sigmas_alone(
+        base_from_flange[turns], whole, mounts[turns[:, 0]]
+    )
     for camera, sigma in zip(cell.cameras, alone, strict=True):
         numbers[f"alone.{camera.name}.fx_px"] = float(sigma)
     caused = float((model.workspace_cost * covariance.matrix).sum())
@@ -127,7 +138,7 @@ def certify(
     )
     undetermined = _undetermined(covariance.labels, values, vectors)
     findings = _findings(cell, numbers, undetermined, len(turns))
-    findings += _apart(cell, seen)
+    findings += _without_station(cell, mounts) + _apart(cell, seen)
     if findings:
         findings.append(_addition(cell, model, information))
     elif small := _too_small(cell, numbers):
@@ -146,6 +157,20 @@ def _of_motion(name: str, covariance: Floats) -> dict[str, float]:
         f"sigma.{name}.translation_mm": float(1e3 * sigma[0]),
         f"sigma.{name}.rotation_deg": float(np.degrees(sigma[1])),
     }
+
+
+def _by_mount(model: StationInformation, mounts: Ints, turns: Ints) -> dict[str, float]:
+    """How many stations and half-turns have each mount; nothing of a single one."""
+    count = len(model.views)
+    if count == 1:
+        return {}
+    stations = np.bincount(mounts, minlength=count)
+    made = np.bincount(mounts[turns[:, 0]], minlength=count)
+    numbers = {}
+    for mount in range(count):
+        numbers[f"mount_{mount + 1}.stations"] = float(stations[mount])
+        numbers[f"mount_{mount + 1}.half_turns"] = float(made[mount])
+    return numbers
 
 
 def _scaled_spectrum(information: Floats) -> tuple[Floats, Floats]:
@@ -239,6 +264,14 @@ def _too_small(cell: Cell, numbers: Mapping[str, float]) -> list[str]:
     return found
 
 
+def _without_station(cell: Cell, mounts: Ints) -> list[str]:
+    """Mounts that no station has."""
+    return [
+        f"no station has {cell.mount_name(mount)}: nothing tells where its markers are"
+        for mount in sorted(set(range(len(cell.mounted))) - set(mounts.tolist()))
+    ]
+
+
 def _apart(cell: Cell, seen: NDArray[np.bool_]) -> list[str]:
     """Cameras that share no station with the first, nor through others."""
     together = seen.T.astype(int) @ seen > 0
@@ -257,25 +290,35 @@ def _apart(cell: Cell, seen: NDArray[np.bool_]) -> list[str]:
 
 def _addition(cell: Cell, model: StationInformation, information: Floats) -> str:
     """Which half-turn helps most, in words; looks at cameras, not at the arm."""
-    view = model.view
-    world = view.draw(np.random.default_rng(0), _DRAWN)
-    seen = view.seen(world) & view.seen(world @ HALF_TURN)
-    enough = seen.sum(axis=1) >= view.required
-    world, seen = world[enough], seen[enough]
-    if len(world) == 0:
+    options = []
+    for mount, view in enumerate(model.views):
+        world = view.draw(np.random.default_rng(0), _DRAWN)
+        seen = view.seen(world) & view.seen(world @ HALF_TURN)
+        enough = seen.sum(axis=1) >= view.required
+        world, seen = world[enough], seen[enough]
+        if len(world) == 0:
+            continue
+        base = model.base_from_world @ world
+        design = Design(
+            model.of_half_turns(
+                np.stack([base, base @ HALF_TURN], axis=1),
+                seen,
+                np.full(len(world), mount, dtype=np.intp),
+            ),
+            model.prior + information,
+            model.workspace_cost,
+        )
+        costs = [design.cost(row) for row in np.eye(len(world))]
+        best = int(np.argmin(costs))
+        options.append((costs[best], mount, world[best]))
+    if not options:
         return "Do: turn the cameras to the workspace box; no half-turn there is seen"
-    base = model.base_from_world @ world
-    poses = np.stack([base, base @ HALF_TURN], axis=1)
-    design = Design(
-        model.of_half_turns(poses, seen),
-        model.prior + information,
-        model.workspace_cost,
-    )
-    costs = [design.cost(row) for row in np.eye(len(world))]
-    best = int(np.argmin(costs))
+    cost, mount, pose = min(options, key=lambda option: option[0])
+    whose = f"of {cell.mount_name(mount)}, " if len(model.views) > 1 else ""
     return (
-        f"Do: add a half-turn {_described(view, world[best])}; then the calibration's "
-        f"part of the track error is {1e3 * np.sqrt(costs[best]):.3f} mm"
+        f"Do: add a half-turn {whose}{_described(model.views[mount], pose)}; then the "
+        "calibration's part of the track error is "
+        f"{1e3 * np.sqrt(cost):.3f} mm"
     )
 
 
@@ -297,10 +340,20 @@ def _described(view: View, world_from_flange: Floats) -> str:
     )
 
 
-def plane_spread_deg(model: StationInformation, base_from_flange: Floats) -> float:
-    """Largest angle between the triangle's planes at stations (n, 4, 4), degrees."""
+def plane_spread_deg(
+    model: StationInformation, base_from_flange: Floats, mounts: Ints
+) -> float:
+    """Largest angle between the triangle's planes at stations, degrees.
+
+    Args:
+        model: Knows where the world is, and how each mount holds the triangle.
+        base_from_flange: Shape (n, 4, 4), metres.
+        mounts: Which mount holds the triangle there, shape (n,).
+    """
     world = np.linalg.inv(model.base_from_world) @ base_from_flange
-    normals = model.view.normals(world)
+    normals = np.zeros((len(world), 3))
+    for mount, view in enumerate(model.views):
+        normals[mounts == mount] = view.normals(world[mounts == mount])
     angles = plane_angles(normals[:, None], normals[None])
     return float(np.degrees(angles.max(initial=0.0)))
 

@@ -160,7 +160,7 @@ class _Planner:
         )
         self.view = View(cell)
         self.model = StationInformation(
-            self.view,
+            cell,
             arm.base_from_world.matrix,
             cell.repeatability,
             cell.plan.expected_sigma_px,
@@ -221,17 +221,24 @@ class _Planner:
             self.model.of_half_turns(
                 np.array([p.base_from_flange for p in pool]),
                 np.array([p.seen for p in pool]),
+                np.zeros(len(pool), dtype=np.intp),
             ),
             self.model.prior
             + self.model.of_stations(
-                self.visited.base_from_flange, self.visited.seen
+                self.visited.base_from_flange,
+                self.visited.seen,
+                np.zeros(len(self.visited.seen), dtype=np.intp),
             ).sum(axis=0),
             self.model.workspace_cost,
         )
 
         def tells(candidate: Candidate) -> Floats:
             poses = candidate.base_from_flange[None]
-            return np.asarray(self.model.of_half_turns(poses, candidate.seen[None])[0])
+            return np.asarray(
+                self.model.of_half_turns(poses, candidate.seen[None], np.zeros(1, int))[
+                    0
+                ]
+            )
 
         selector = Selector(design, pool, search, self.wanted, checked, tells)
         if selector.probe() == 0:
@@ -305,7 +312,9 @@ class _Planner:
                 [pool[k].base_from_flange[0] for k in chosen],
             ]
         )
-        spread = plane_spread_deg(self.model, poses)
+        spread = plane_spread_deg(
+            self.model, poses, np.zeros(len(poses), dtype=np.intp)
+        )
         if len(poses) > 1 and spread < self.cell.plan.min_plane_spread_deg:
             self.rejected["plane_spread"] += 1
             raise self._no_plan(
@@ -353,6 +362,7 @@ class _Planner:
                 ]
             ),
             np.concatenate([self.visited.seen, [route[k][0].seen for k in used]]),
+            np.zeros(before + len(used), dtype=np.intp),
             np.concatenate(
                 [self.visited.turns, before + np.searchsorted(used, np.array(pairs))]
             ),

@@ -66,11 +66,13 @@ def certify_stations(cell: Cell, arm: Arm, joints: ArrayLike) -> Plan:
     view = View(cell)
     base = arm.base_from_world.matrix
     model = StationInformation(
-        view, base, cell.repeatability, cell.plan.expected_sigma_px
+        cell, base, cell.repeatability, cell.plan.expected_sigma_px
     )
     seen = view.seen(arm.base_from_world.inverse().matrix @ poses)
     forbidden = _forbidden(arm, view, q, seen)
-    certificate = certify(cell, model, poses, seen, turns)
+    certificate = certify(
+        cell, model, poses, seen, np.zeros(len(poses), dtype=np.intp), turns
+    )
     times = travel_time(
         np.array([arm.home, *q[:-1]]), q, arm.speed, cell.arm.acceleration_time_s
     )

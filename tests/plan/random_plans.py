@@ -39,11 +39,12 @@ class RandomPlans:
     @classmethod
     def of(cls, cell: Cell, arm: Arm, model: StationInformation) -> RandomPlans:
         """Search once; what is drawn later is from the same half-turns."""
-        search = CandidateSearch(model.view, arm, np.random.default_rng(1))
+        search = CandidateSearch(model.views[0], arm, np.random.default_rng(1))
         found = [first for first, *_ in search.find(_FEASIBLE, turns=True)]
         information = model.of_half_turns(
             np.array([c.base_from_flange for c in found]),
             np.array([c.seen for c in found]),
+            np.zeros(len(found), dtype=np.intp),
         )
         return cls(found, Design(information, model.prior, model.workspace_cost))
 

@@ -15,7 +15,6 @@ from handeye_tri.config import Cell
 from handeye_tri.evaluate import evaluate_track
 from handeye_tri.hand_eye import calibrate_hand_eye
 from handeye_tri.plan.information import StationInformation
-from handeye_tri.plan.poses import View
 from handeye_tri.records import (
     Covariance,
     GroundTruth,
@@ -35,7 +34,7 @@ Floats = NDArray[np.float64]
 def predictions(cell: Cell, arm: Arm) -> StationInformation:
     """What stations of the cell tell, as its plan predicts it."""
     return StationInformation(
-        View(cell),
+        cell,
         arm.base_from_world.matrix,
         cell.repeatability,
         cell.plan.expected_sigma_px,
@@ -52,10 +51,11 @@ def geometry(
     return Geometry(
         cell.rig.triangle,
         cell.rig.flange_from_triangle,
-        model.view.cameras,
-        tuple(SE3(model.base_from_world @ m) for m in model.view.world_from_camera),
+        model.views[0].cameras,
+        tuple(SE3(model.base_from_world @ m) for m in model.views[0].world_from_camera),
         tuple(stations),
         tuple(half_turns),
+        tuple(view.flange_from_triangle for view in model.views[1:]),
     )
 
 
@@ -105,14 +105,20 @@ def workspace_test(
     cell: Cell, model: StationInformation, rng: np.random.Generator
 ) -> WorkspaceTest:
     """Stations at the places that the track error is predicted at."""
-    poses, seen = model.places
-    stations = [
-        Station(k, "evaluation", np.empty(0), SE3(pose)) for k, pose in enumerate(poses)
+    there = [
+        one
+        for at in model.places
+        for one in zip(at.base_from_flange, at.seen, at.mounts.tolist(), strict=True)
     ]
-    there = geometry(cell, model, stations, ())
+    stations = [
+        Station(k, "evaluation", np.empty(0), SE3(pose), mount)
+        for k, (pose, _, mount) in enumerate(there)
+    ]
+    seen = np.array([one[1] for one in there])
+    box = geometry(cell, model, stations, ())
 
     def session(sigma_px: float, robot: Repeatability | None) -> Session:
-        made, _ = synthesize(there, rng, sigma_px=sigma_px, repeatability=robot)
+        made, _ = synthesize(box, rng, sigma_px=sigma_px, repeatability=robot)
         pixels = np.where(seen.T[..., None, None], made.pixels, np.nan)
         return asked(replace(made, pixels=pixels), cell)
 

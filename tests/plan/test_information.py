@@ -6,15 +6,16 @@ import pytest
 
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera, triangulate
 from handeye_tri.plan.information import StationInformation
-from handeye_tri.plan.poses import View
-from handeye_tri.records import MARKER_LABELS
+from handeye_tri.records import marker_labels
 from handeye_tri.se3 import SE3, se3_exp, se3_inverse
 
 SIGMA = 0.05
 NO_ERROR = np.zeros(6)
 
 
-@pytest.fixture(params=["hp3_stereo", "hp3_stereo_lens", "hp3_stereo_edge"])
+@pytest.fixture(
+    params=["hp3_stereo", "hp3_stereo_lens", "hp3_stereo_edge", "hp3_stereo_both"]
+)
 def cell(request):
     return scene.cell_of(request.param)
 
@@ -24,18 +25,23 @@ class Predicted:
 
     def __init__(self, cell):
         self.cell = cell
-        self.view = View(cell)
         self.base_from_world = se3_exp([0.1, 0.2, 0.3, 0.2, -0.1, 0.4])
         self.model = StationInformation(
-            self.view, self.base_from_world, cell.repeatability, SIGMA
+            cell, self.base_from_world, cell.repeatability, SIGMA
         )
-        poses = self.view.draw(np.random.default_rng(5), 60)
-        poses = poses[self.view.in_image(poses).all(axis=1)][:12]
-        self.poses = self.base_from_world @ poses
-        self.seen = np.ones((len(poses), len(self.view.cameras)), dtype=bool)
+        self.view = self.model.views[0]
+        drawn, mounts = [], []
+        for mount, view in enumerate(self.model.views):
+            poses = view.draw(np.random.default_rng(5), 60)
+            drawn.append(poses[view.in_image(poses).all(axis=1)][:12])
+            mounts += [mount] * len(drawn[-1])
+        self.mounts = np.array(mounts)
+        self.poses = self.base_from_world @ np.concatenate(drawn)
+        self.seen = np.ones((len(self.poses), len(self.view.cameras)), dtype=bool)
+        self.there = self.poses, self.seen, self.mounts
 
     def deviated(self, delta):
-        """Cameras, base_from_camera and markers (3, 3), off by delta (p,)."""
+        """Cameras, base_from_camera and markers (n, 3, 3), off by delta (p,)."""
         value = dict(zip(self.model.labels, delta, strict=True))
         cameras, motions = [], []
         for i, camera in enumerate(self.view.cameras):
@@ -54,8 +60,14 @@ class Predicted:
             )  # fmt: skip
             nominal = self.base_from_world @ self.view.world_from_camera[i]
             motions.append(nominal @ se3_exp(self._tangent(value, f"base_from_{n}")))
-        off = np.array([value[label] for label in MARKER_LABELS]).reshape(3, 3)
-        return cameras, motions, self.view.markers + off
+        markers = np.array(
+            [
+                view.markers
+                + np.reshape([value[label] for label in marker_labels(mount)], (3, 3))
+                for mount, view in enumerate(self.model.views)
+            ]
+        )
+        return cameras, motions, markers[self.mounts]
 
     @staticmethod
     def _tangent(value, name):
@@ -105,9 +117,11 @@ def test_information_is_that_of_the_whole_least_squares_problem(cell):
         expected[j] = normal[:p, :p] - coupling @ np.linalg.solve(
             normal[p:, p:], coupling.T
         )
-    found = scenario.model.of_stations(scenario.poses, scenario.seen)
+    found = scenario.model.of_stations(*scenario.there)
     # Both sides in units where every diagonal is 1: differences cost 1e-7 relative.
-    scale = 1 / np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
+    # A station tells nothing of the other mount's markers.
+    diagonal = np.diagonal(expected, axis1=1, axis2=2)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     unit = scale[:, :, None] * scale[:, None, :]
     np.testing.assert_allclose(found * unit, expected * unit, atol=1e-5)
 
@@ -115,14 +129,15 @@ def test_information_is_that_of_the_whole_least_squares_problem(cell):
 def test_an_exact_robot_is_the_limit_of_a_good_one(cell):
     scenario = Predicted(cell)
     exact = StationInformation(
-        scenario.view,
+        cell,
         scenario.base_from_world,
         type(cell.repeatability)(0.0, 0.0),
         SIGMA,
-    ).of_stations(scenario.poses, scenario.seen)
+    ).of_stations(*scenario.there)
     # Information only grows as the robot gets better.
-    gained = exact - scenario.model.of_stations(scenario.poses, scenario.seen)
-    scale = 1 / np.sqrt(np.diagonal(exact, axis1=1, axis2=2))
+    gained = exact - scenario.model.of_stations(*scenario.there)
+    diagonal = np.diagonal(exact, axis1=1, axis2=2)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     eigenvalues = np.linalg.eigvalsh(gained * scale[:, :, None] * scale[:, None, :])
     assert eigenvalues.min() > -1e-9
     assert eigenvalues.max() > 0.1
@@ -142,7 +157,7 @@ def test_track_derivatives_meet_triangulation(cell):
         )
         return observed.reshape(n, 3, 3) - scenario.markers(rig)
 
-    found = scenario.model.track_derivatives(scenario.poses, scenario.seen)
+    found = scenario.model.track_derivatives(*scenario.there)
     # A step of 1e-4 keeps differences of points near 1 m at 1e-11, the truncation
     # at 1e-8 of derivatives up to 10.
     expected = numeric(track, p, step=1e-4)
@@ -151,7 +166,7 @@ def test_track_derivatives_meet_triangulation(cell):
 
 def test_covariance_is_the_inverse_and_names_what_is_estimated(cell):
     scenario = Predicted(cell)
-    information = scenario.model.of_stations(scenario.poses, scenario.seen).sum(axis=0)
+    information = scenario.model.of_stations(*scenario.there).sum(axis=0)
     covariance = scenario.model.covariance(information)
     product = covariance.matrix @ (information + scenario.model.prior)
     np.testing.assert_allclose(product, np.eye(len(product)), atol=1e-5)
@@ -160,3 +175,39 @@ def test_covariance_is_the_inverse_and_names_what_is_estimated(cell):
         asked |= {"skew"} if config.estimate.skew else set()
         own = {x.split(".")[1] for x in covariance.labels if x.startswith(config.name)}
         assert own == asked
+
+
+def test_a_station_tells_of_its_own_mount_only():
+    scenario = Predicted(scene.cell_of("hp3_stereo_both"))
+    labels = scenario.model.labels
+    assert labels[-18:] == (*marker_labels(0), *marker_labels(1))
+    information = scenario.model.of_stations(*scenario.there)
+    of = np.array([labels.index("marker_A.x"), labels.index("marker_A_2.x")])
+    for mount in (0, 1):
+        own, other = of[mount] + np.arange(9), of[1 - mount] + np.arange(9)
+        there = information[scenario.mounts == mount]
+        assert not there[:, other].any()
+        assert (np.diagonal(there[:, own][:, :, own], axis1=1, axis2=2) > 0).all()
+
+
+def test_either_mount_counts_alike_in_the_workspace():
+    """The joint cost is the mean of those of cells with one mount each."""
+    both = scene.cell_of("hp3_stereo_both")
+    base = np.eye(4)
+    joint = StationInformation(both, base, both.repeatability, SIGMA)
+    alone = [
+        StationInformation(cell, base, cell.repeatability, SIGMA)
+        for cell in both.mounted
+    ]
+    assert joint.workspace_noise == pytest.approx(
+        np.mean([one.workspace_noise for one in alone])
+    )
+    cameras = len(joint.labels) - 18
+    costs = np.array([one.workspace_cost for one in alone])
+    expected = costs[:, :cameras, :cameras].mean(axis=0)
+    np.testing.assert_allclose(joint.workspace_cost[:cameras, :cameras], expected)
+    for mount, cost in enumerate(costs):
+        own = slice(cameras + 9 * mount, cameras + 9 * mount + 9)
+        np.testing.assert_allclose(
+            joint.workspace_cost[own, own], 0.5 * cost[cameras:, cameras:], atol=1e-12
+        )

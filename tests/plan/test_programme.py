@@ -176,11 +176,11 @@ def test_the_chosen_half_turns_tell_more_than_random_ones():
     first = search.find(11, turns=True)
     sigma = plan.certificate["sigma_px"]
     model = StationInformation(
-        view, arm.base_from_world.matrix, cell.repeatability, sigma
+        cell, arm.base_from_world.matrix, cell.repeatability, sigma
     )
     poses = np.concatenate([c.base_from_flange for (c,) in first])
     random = model.covariance(
-        model.of_stations(poses, np.ones((22, 2), bool)).sum(axis=0)
+        model.of_stations(poses, np.ones((22, 2), bool), np.zeros(22, int)).sum(axis=0)
     )
     assert plan.certificate["sigma.left.fx_px"] < 0.8 * random.std("left.fx")
 
@@ -332,10 +332,10 @@ def test_what_is_planned_next_adds_most_to_what_was_seen():
     least = cell.plan.min_plane_spread_deg
     assert more.certificate["plane_spread_deg"] >= least
     model = StationInformation(
-        View(cell), arm.base_from_world.matrix, cell.repeatability, 0.03
+        cell, arm.base_from_world.matrix, cell.repeatability, 0.03
     )
     both, turns = np.ones((10, 2), dtype=bool), np.arange(10).reshape(-1, 2)
-    usual = certify(cell, model, poses[:10], both, turns).numbers
+    usual = certify(cell, model, poses[:10], both, np.zeros(10, int), turns).numbers
     name = "track_calibration_rms_mm"
     assert more.certificate[name] < usual[name]
     assert more.certificate[name] > scene.plan_of("hp3_stereo").certificate[name]
