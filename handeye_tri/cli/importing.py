@@ -88,6 +88,12 @@ def _numbers(text: str, count: int, option: str, what: str) -> list[float]:
 @click.option("--half-turns", metavar="PAIRS", help="Not as found: 0-1,2-3.")
 @click.option("--held-out", metavar="STATIONS", help="For the test: 12-17, or none.")
 @click.option(
+    "--tool-change",
+    metavar="STATION",
+    type=click.IntRange(min=0),
+    help="The first station with the second mount.",
+)
+@click.option(
     "--turn-tolerance",
     metavar="DEG,MM",
     default="1,1",
@@ -117,6 +123,7 @@ def import_(
     joints: str | None,
     half_turns: str | None,
     held_out: str | None,
+    tool_change: int | None,
     turn_tolerance: str,
     still: str,
     orthonormalise: bool,
@@ -151,6 +158,7 @@ def import_(
         joints=tuple(name.strip() for name in joints.split(",")) if joints else (),
         still=Stillness(1e-3 * move, math.radians(turn), stand),
         orthonormalise=orthonormalise,
+        tool_change=tool_change,
     )
     found = read_source(layout, source, named)
     for proposal in found.proposals:
@@ -165,6 +173,7 @@ def import_(
                 half_turns,
                 held_out,
                 TurnTolerance(math.radians(degrees), 1e-3 * mm),
+                found.tool_change,
             ),
             Source(layout, str(source), shlex.join(["handeye-tri", *sys.argv[1:]])),
             progress,

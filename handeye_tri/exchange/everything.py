@@ -70,9 +70,18 @@ def _definitions() -> Json:
         {
             "index": {"type": "integer"},
             "kind": {"enum": ["calibration", "evaluation"]},
+            "mount": {"type": "integer", "minimum": 0},
             "joints_rad_or_m": {"type": "array", "items": _NUMBER},
             "base_from_flange": _ref("motion"),
-        }
+        },
+        description="mount: what holds the triangle there; 0 before a tool change",
+    )
+    mount = _object(
+        {
+            "flange_from_triangle": _ref("motion"),
+            "markers_in_flange_m": _row(3, _row(3)),
+        },
+        description="after the tool change",
     )
     half_turn = _object(
         {
@@ -86,6 +95,7 @@ def _definitions() -> Json:
         "camera": camera,
         "covariance": covariance,
         "station": station,
+        "mount": mount,
         "half_turn": half_turn,
         "gate": _object({key: _TEXT for key in ("name", "found", "limit", "verdict")}),
         "finding": _object(
@@ -140,6 +150,11 @@ def json_schema() -> Json:
                     {
                         "stations": {**many, "items": _ref("station")},
                         "half_turns": {**many, "items": _ref("half_turn")},
+                        "tool_change": {
+                            "type": ["object", "null"],
+                            "properties": {"before": {"type": "integer"}},
+                            "required": ["before"],
+                        },
                     }
                 ),
                 "observations": _object(
@@ -159,6 +174,7 @@ def json_schema() -> Json:
                         "base_from_camera": motions,
                         "flange_from_triangle": _ref("motion"),
                         "markers_in_flange_m": _row(3, _row(3)),
+                        "other_mounts": {**many, "items": _ref("mount")},
                     }
                 ),
                 "evaluation": _object(

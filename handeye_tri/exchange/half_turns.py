@@ -84,7 +84,9 @@ def turn_between(base_from_flange: Floats, before: int, after: int) -> Turn:
     return Turn(before, after, np.pi - angle, axis, foot, pitch)
 
 
-def find_half_turns(base_from_flange: Floats, tolerance: TurnTolerance) -> FoundTurns:
+def find_half_turns(
+    base_from_flange: Floats, tolerance: TurnTolerance, within: range | None = None
+) -> FoundTurns:
     """Pair the stations that a half-turn of the rig joins.
 
     The rig is rigid on the flange, so that all its half-turns have one axis there, and
@@ -97,12 +99,15 @@ def find_half_turns(base_from_flange: Floats, tolerance: TurnTolerance) -> Found
     Args:
         base_from_flange: Reported poses, shape (n, 4, 4), metres.
         tolerance: What counts as a half-turn.
+        within: Stations with one mount, in a row; None: all.
     """
+    within = within or range(len(base_from_flange))
+    alike = base_from_flange[within.start : within.stop]
     candidates = [
         turn
-        for before, after in _nearly_opposite(base_from_flange, tolerance.angle)
-        if abs((turn := turn_between(base_from_flange, before, after)).miss)
-        <= tolerance.angle
+        for before, after in _nearly_opposite(alike, tolerance.angle)
+        for turn in [turn_between(base_from_flange, within[before], within[after])]
+        if abs(turn.miss) <= tolerance.angle
     ]
     support = _support(candidates, tolerance)
     # Stations that follow each other first: a leader that nothing else agrees with

@@ -1,7 +1,8 @@
 """A whole session as a rosbag2/MCAP file: what a recording of the real cell holds.
 
 The robot stands at every station for a second, nine samples of joints and frames long;
-the cameras shoot in the middle. Station j is at ``10 (j + 1)`` seconds.
+the cameras shoot in the middle. Station j is at ``10 (j + 1)`` seconds. The frame
+``triangle`` is static on the flange; with a tool change it moves in ``/tf``.
 """
 
 from __future__ import annotations
@@ -177,8 +178,9 @@ def _messages(bag: Bag) -> Iterable[tuple[str, str, int, dict[str, Any]]]:
             calibration.cameras, calibration.base_from_camera, strict=True
         )
     ]
-    rig = calibration.flange_from_triangle.matrix
-    fixed.append(_transform(start, frames.flange, "triangle", rig))
+    rigs = [mount.flange_from_triangle.matrix for mount in calibration.mounts]
+    if len(rigs) == 1:
+        fixed.append(_transform(start, frames.flange, "triangle", rigs[0]))
     yield "/tf_static", "tf2_msgs/TFMessage", start, {"transforms": fixed}
     pair = rectify(calibration.cameras, calibration.base_from_camera)
     for j, pose in enumerate(results.base_from_flange):
@@ -190,6 +192,9 @@ def _messages(bag: Bag) -> Iterable[tuple[str, str, int, dict[str, Any]]]:
                 _transform(time, parent, child, poses[j])
                 for parent, child, poses in bag.links
             ]
+            if len(rigs) > 1:
+                rig = rigs[results.mounts[j]]
+                moved.append(_transform(time, frames.flange, "triangle", rig))
             yield "/tf", "tf2_msgs/TFMessage", time, {"transforms": moved}
             if bag.joint_names:
                 state = _joint_state(time, bag.joint_names, bag.joints[j])

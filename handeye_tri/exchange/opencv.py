@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from handeye_tri.exchange.results import Results, number, skew_effect_px
-from handeye_tri.records import Floats
+from handeye_tri.records import Floats, triangle_name
 
 
 def opencv_yaml(results: Results) -> str:
@@ -25,6 +25,10 @@ def opencv_yaml(results: Results) -> str:
         f"flange_from_triangle_m maps the triangle's frame to {frames.flange}; rows of "
         "markers_in_flange_m are A, B, C.",
     ]
+    if calibration.other_mounts:
+        lines.append(
+            "The same with _2 before _m: on the second mount, after the tool change."
+        )
     for camera in calibration.cameras:
         k = camera.intrinsics
         if k.skew:
@@ -54,8 +58,11 @@ def opencv_yaml(results: Results) -> str:
             camera_from_first = place.inverse() @ first
             text += _matrix("R", camera_from_first.rotation, "   ")
             text += _matrix("T_m", camera_from_first.translation[:, None], "   ")
-    text += _matrix("flange_from_triangle_m", calibration.flange_from_triangle.matrix)
-    text += _matrix("markers_in_flange_m", calibration.markers)
+    for index, mount in enumerate(calibration.mounts):
+        name = triangle_name(index)
+        suffix = name.removeprefix(triangle_name())
+        text += _matrix(f"{name}_m", mount.flange_from_triangle.matrix)
+        text += _matrix(f"markers_in_flange{suffix}_m", mount.markers)
     return text
 
 

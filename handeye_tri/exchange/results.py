@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handeye_tri.errors import InputError
 from handeye_tri.records import Floats, HandEyeCalibration
@@ -58,6 +59,7 @@ class Results:
         sentence: The headline that belongs to the verdict.
         simulated: Whether the data are simulated.
         base_from_flange: Reported flange poses, shape (n, 4, 4), metres.
+        mounts: Which mount holds the triangle at each station, shape (n,), from 0.
         stations: Station of each of ``observed_base_from_flange``, shape (s,).
         observed_base_from_flange: Flange poses as the cameras observe them through
             the calibration, shape (s, 4, 4), metres.
@@ -70,6 +72,7 @@ class Results:
     sentence: str
     simulated: bool
     base_from_flange: Floats
+    mounts: NDArray[np.intp]
     stations: tuple[int, ...]
     observed_base_from_flange: Floats
     frames: FrameNames = FrameNames()

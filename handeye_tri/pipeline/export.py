@@ -77,6 +77,8 @@ def read_results(run: Run, frames: FrameNames) -> Results:
         cost_start=0.0,
         method=hand_eye.method,
     )
+    held = np.array([mount.flange_from_triangle.matrix for mount in hand_eye.mounts])
+    flange_from_triangle = held[session.mounts]
     observed = triangle_poses(
         session.triangle,
         cameras,
@@ -85,7 +87,7 @@ def read_results(run: Run, frames: FrameNames) -> Results:
         session.marker_radii,
         start=se3_inverse(hand_eye.base_from_camera[0].matrix)
         @ session.base_from_flange
-        @ hand_eye.flange_from_triangle.matrix,
+        @ flange_from_triangle,
     )
     return Results(
         cell=run.cell.name,
@@ -94,10 +96,11 @@ def read_results(run: Run, frames: FrameNames) -> Results:
         sentence=str(evaluation["sentence"]),
         simulated=session.simulated,
         base_from_flange=session.base_from_flange,
+        mounts=session.mounts,
         stations=tuple(observed.views.tolist()),
         observed_base_from_flange=base_from_first.matrix
         @ observed.reference_from_triangle
-        @ se3_inverse(hand_eye.flange_from_triangle.matrix),
+        @ se3_inverse(flange_from_triangle[observed.views]),
         frames=frames,
     )
 
@@ -194,12 +197,20 @@ def _everything(run: Run, results: Results) -> dict[str, str]:
 
 
 def _bag(run: Run, results: Results) -> exchange.Bag:
-    header, stations = run.folder.header, run.plan().stations
-    about = {
+    header, plan = run.folder.header, run.plan()
+    about: dict[str, Any] = {
         "schema": exchange.EXPORT_SCHEMA,
         "notice": results.head,
         "session": {key: header[key] for key in _HEADER if key in header},
     }
+    if plan.tool_change is not None:
+        about["tool_change"] = {"before": plan.tool_change.before}
+        about["notice"] = [
+            *results.head,
+            f"The tool is changed before station {plan.tool_change.before}: the frame "
+            "triangle moves on the flange then, and the robot's description has no "
+            "holder.",
+        ]
 
     def photograph(camera: str, station: int) -> bytes | None:
         if not run.was_taken(camera, station):
@@ -209,13 +220,15 @@ def _bag(run: Run, results: Results) -> exchange.Bag:
     bag = exchange.Bag(results, json.dumps(about, ensure_ascii=False), photograph)
     if not run.has_robot:
         return bag
-    joints = np.array([station.joints for station in stations])
-    names = exchange.link_names(
-        run.mechanism, results.frames.base, results.frames.flange
-    )
+    joints = np.array([station.joints for station in plan.stations])
+    mechanism = run.mechanism
+    if plan.tool_change is not None:
+        bare = [g for g in mechanism.geometries if g.body != mechanism.marker_body]
+        mechanism = replace(mechanism, geometries=tuple(bare))
+    names = exchange.link_names(mechanism, results.frames.base, results.frames.flange)
     world_from_body = run.arm.body_poses(joints)
     links = []
-    for index, body in enumerate(run.mechanism.bodies[1:], 1):
+    for index, body in enumerate(mechanism.bodies[1:], 1):
         parent_from_world = se3_inverse(world_from_body[:, body.parent])
         pose = parent_from_world @ world_from_body[:, index]
         links.append((names[body.parent], names[index], pose))
@@ -223,6 +236,6 @@ def _bag(run: Run, results: Results) -> exchange.Bag:
         bag,
         joint_names=run.arm.joint_names,
         joints=joints,
-        description=exchange.robot_urdf(run.mechanism, names),
+        description=exchange.robot_urdf(mechanism, names),
         links=links,
     )

@@ -27,7 +27,7 @@ from handeye_tri.exchange.half_turns import (
 from handeye_tri.pipeline.execution import inputs_of
 from handeye_tri.pipeline.run import METHODS, PLAN_SCHEMA, Progress, Run, software
 from handeye_tri.pipeline.stages import stages_of
-from handeye_tri.records import Floats, HalfTurn, Plan, Station
+from handeye_tri.records import Floats, HalfTurn, Plan, Station, ToolChange
 from handeye_tri.storage import SessionFolder, codec
 
 # Fewer half-turns determine no camera (Zhao, Liu and Zhang 2008, Sec. III-A).
@@ -57,11 +57,14 @@ class Corrections:
         half_turns: Pairs instead of those found, such as "0-1,2-3"; None to find them.
         held_out: Stations for the test, such as "12-17"; None: those of no half-turn.
         tolerance: What counts as a half-turn where they are found.
+        tool_change: The first station with the cell's second mount; None: there is
+            none.
     """
 
     half_turns: str | None
     held_out: str | None
     tolerance: TurnTolerance
+    tool_change: int | None = None
 
 
 def import_session(
@@ -94,15 +97,16 @@ def import_session(
         What was found, in lines for the user.
 
     Raises:
-        InputError: too few half-turns, poses that no robot makes, or an image of the
-            wrong size.
+        InputError: too few half-turns, poses that no robot makes, an image of the
+            wrong size, or a tool change that is not stated or not possible.
         StorageError: the folder holds something else, or an image is damaged.
     """
     base_from_flange = np.array([s.base_from_flange.matrix for s in capture.shots])
-    turns, lines = _half_turns(base_from_flange, cell, corrections, others)
+    mounts = _mounts(cell, corrections.tool_change, len(base_from_flange))
+    turns, lines = _half_turns(base_from_flange, mounts, cell, corrections, others)
     _check_spread(base_from_flange)
     held_out = _held_out(turns, len(base_from_flange), corrections.held_out)
-    plan = _plan(capture, turns, held_out, cell)
+    plan = _plan(capture, mounts, turns, held_out, cell)
     folder = _folder(out, cell, source, cell_file, model_file, len(turns))
     run = Run(folder, progress)
     with folder.locked():
@@ -137,8 +141,32 @@ def _check_spread(base_from_flange: Floats) -> None:
         )
 
 
+def _mounts(cell: CellToCalibrate, tool_change: int | None, count: int) -> list[range]:
+    """The stations of each mount."""
+    if cell.second_mount is None:
+        if tool_change is not None:
+            raise InputError(
+                f"--tool-change {tool_change}: cell {cell.name} has one mount; leave "
+                "it out, or state second_mount in the cell"
+            )
+        return [range(count)]
+    if tool_change is None:
+        raise InputError(
+            f"cell {cell.name} has two mounts; say which station, counted from 0, is "
+            "the first with the second one: --tool-change STATION"
+        )
+    if not 0 < tool_change < count:
+        raise InputError(
+            f"--tool-change {tool_change}: it must be one of the stations 1 to "
+            f"{count - 1}, so that each mount has some"
+        )
+    return [range(tool_change), range(tool_change, count)]
+
+
 def _other_reading(
-    others: Callable[[], Iterable[tuple[str, Floats]]], tolerance: TurnTolerance
+    others: Callable[[], Iterable[tuple[str, Floats]]],
+    mounts: Sequence[range],
+    tolerance: TurnTolerance,
 ) -> str:
     """By which other reading there would be half-turns, or what else to do."""
     least, most = PLAUSIBLE_SPREAD
@@ -147,7 +175,10 @@ def _other_reading(
         spread = float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
         if not least <= spread <= most:
             continue
-        count = len(find_half_turns(poses, tolerance).turns)
+        count = sum(
+            len(find_half_turns(poses, tolerance, stations).turns)
+            for stations in mounts
+        )
         if count > best:
             best, words = count, options
     if words:
@@ -160,47 +191,79 @@ def _other_reading(
 
 def _half_turns(
     base_from_flange: Floats,
+    mounts: Sequence[range],
     cell: CellToCalibrate,
     corrections: Corrections,
     others: Callable[[], Iterable[tuple[str, Floats]]],
 ) -> tuple[tuple[Turn, ...], list[str]]:
     """The half-turns, and what to tell of them."""
-    named = corrections.half_turns is not None
+    tolerance = corrections.tolerance
+    named = None
     if corrections.half_turns is not None:
         pairs = parse_pairs(corrections.half_turns, "--half-turns")
-        turns = named_turns(base_from_flange, pairs, "--half-turns")
-        found = FoundTurns(turns, (), np.zeros(3), np.zeros(3))
-    else:
-        found = find_half_turns(base_from_flange, corrections.tolerance)
+        named = named_turns(base_from_flange, pairs, "--half-turns")
+        _check_mounts(named, mounts)
+    turns: list[Turn] = []
+    rejected: list[str] = []
+    lines: list[str] = []
+    for number, (stations, axis) in enumerate(zip(mounts, cell.axes, strict=True), 1):
+        if named is None:
+            found = find_half_turns(base_from_flange, tolerance, stations)
+        else:
+            own = tuple(turn for turn in named if turn.before in stations)
+            found = FoundTurns(own, (), np.zeros(3), np.zeros(3))
+        turns += found.turns
+        rejected += found.others
+        where = f"mount {number}: " if len(mounts) > 1 else ""
+        lines.append(
+            f"{where}{counted(len(found.turns), 'half-turn')} about {axis} "
+            f"{'found in the poses' if named is None else 'as named'} (--half-turns):"
+        )
+        lines += _turn_lines(found, cell, tolerance, named=named is not None)
+    if len(turns) < _LEAST_TURNS:
+        raise InputError(
+            f"{counted(len(turns), 'half-turn')} among "
+            f"{counted(len(base_from_flange), 'station')}, at least "
+            f"{_LEAST_TURNS} are needed; "
+            + ("; ".join(rejected[:3]) + "; " if rejected else "")
+            + _other_reading(others, mounts, tolerance)
+        )
+    return tuple(turns), lines
+
+
+def _check_mounts(turns: Sequence[Turn], mounts: Sequence[range]) -> None:
+    """Raise InputError where a half-turn goes on over the tool change."""
+    for turn in turns:
+        if not any(turn.before in own and turn.after in own for own in mounts):
+            raise InputError(
+                f"--half-turns: {turn.before}-{turn.after} goes on over the tool "
+                f"change before station {mounts[-1].start}; a half-turn is made with "
+                "one mount"
+            )
+
+
+def _turn_lines(
+    found: FoundTurns, cell: CellToCalibrate, tolerance: TurnTolerance, *, named: bool
+) -> list[str]:
+    """The half-turns of a mount, what is none, and their axis where they were found."""
     lines = [
-        f"{counted(len(found.turns), 'half-turn')} about {cell.rig.axis} "
-        f"{'as named' if named else 'found in the poses'} (--half-turns):"
-    ]
-    lines += [
         f"  {turn.before}-{turn.after}: {180 - np.degrees(turn.miss):.3f} deg, "
         f"{1e3 * turn.pitch:+.3f} mm along the axis"
         for turn in found.turns
     ]
     lines += [f"  not {text}" for text in found.others]
-    if len(found.turns) < _LEAST_TURNS:
-        raise InputError(
-            f"{counted(len(found.turns), 'half-turn')} among "
-            f"{counted(len(base_from_flange), 'station')}, at least "
-            f"{_LEAST_TURNS} are needed; "
-            + ("; ".join(found.others[:3]) + "; " if found.others else "")
-            + _other_reading(others, corrections.tolerance)
+    if named or not found.turns:
+        return lines
+    axis = " ".join(f"{value:+.3f}" for value in found.axis)
+    foot = " ".join(f"{value:+.2f}" for value in 1e3 * found.foot)
+    lines.append(f"  their axis in the flange: {axis} through {foot} mm")
+    off = float(np.degrees(np.arccos(min(1.0, abs(found.axis[2])))))
+    if isinstance(cell, Cell) and off > np.degrees(tolerance.angle):
+        lines.append(
+            f"  note: the cell has the rig's axis along the flange's z, this is "
+            f"{off:.1f} deg off it"
         )
-    if not named:
-        axis = " ".join(f"{value:+.3f}" for value in found.axis)
-        foot = " ".join(f"{value:+.2f}" for value in 1e3 * found.foot)
-        lines.append(f"  their axis in the flange: {axis} through {foot} mm")
-        off = float(np.degrees(np.arccos(min(1.0, abs(found.axis[2])))))
-        if isinstance(cell, Cell) and off > np.degrees(corrections.tolerance.angle):
-            lines.append(
-                f"  note: the cell has the rig's axis along the flange's z, this is "
-                f"{off:.1f} deg off it"
-            )
-    return found.turns, lines
+    return lines
 
 
 def _held_out(turns: Sequence[Turn], count: int, text: str | None) -> list[int]:
@@ -218,8 +281,14 @@ def _held_out(turns: Sequence[Turn], count: int, text: str | None) -> list[int]:
 
 
 def _plan(
-    capture: Capture, turns: Sequence[Turn], held_out: list[int], cell: CellToCalibrate
+    capture: Capture,
+    mounts: Sequence[range],
+    turns: Sequence[Turn],
+    held_out: list[int],
+    cell: CellToCalibrate,
 ) -> Plan:
+    carried = [k for k, stations in enumerate(mounts) for _ in stations]
+    nowhere = np.zeros(0)
     return Plan(
         stations=tuple(
             Station(
@@ -227,15 +296,23 @@ def _plan(
                 "evaluation" if j in held_out else "calibration",
                 shot.joints,
                 shot.base_from_flange,
+                carried[j],
             )
             for j, shot in enumerate(capture.shots)
         ),
-        half_turns=tuple(HalfTurn(t.before, t.after, cell.rig.axis) for t in turns),
+        half_turns=tuple(
+            HalfTurn(turn.before, turn.after, cell.axes[carried[turn.before]])
+            for turn in turns
+        ),
         rejected={},
         certificate={},
         seed=0,
         outcome="CANNOT TELL",
         findings=("the stations were imported, nothing was planned for them",),
+        # Where the robot waited is not in the data.
+        tool_change=ToolChange(mounts[1].start, nowhere, np.zeros((0, 0)))
+        if len(mounts) > 1
+        else None,
     )
 
 

@@ -66,6 +66,7 @@ class Named:
         joints: What the recording calls the arm's joints.
         still: When the robot counts as standing.
         orthonormalise: Take rotations that are rounded.
+        tool_change: The first station with the cell's second mount.
     """
 
     cell: str | None = None
@@ -79,6 +80,7 @@ class Named:
     joints: tuple[str, ...] = ()
     still: Stillness = field(default_factory=Stillness)
     orthonormalise: bool = False
+    tool_change: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,6 +93,8 @@ class Found:
         cell_file: Where its description was.
         model_file: The robot's model; "" where there is none.
         proposals: Options that were taken as proposed, as a user would type them.
+        tool_change: The first station with the cell's second mount, as named, or as
+            the source itself has it; None where neither says so.
         others: What else the poses' numbers could mean: the options that say so, and
             the poses so read, (n, 4, 4), metres.
     """
@@ -100,6 +104,7 @@ class Found:
     cell_file: str
     model_file: str
     proposals: tuple[str, ...] = ()
+    tool_change: int | None = None
     others: Callable[[], Iterable[tuple[str, Floats]]] = tuple
 
 
@@ -124,7 +129,9 @@ def read_source(layout: str, source: Path, named: Named) -> Found:
         if layout == "euroc"
         else _from_images(layout, source, named, cell)
     )
-    found = Found(capture, cell, cell_file, model_file)
+    found = Found(
+        *(capture, cell, cell_file, model_file), tool_change=named.tool_change
+    )
     if named.pose_format is None or named.image_times is not None:
         return found
     stated = PoseFormat.parse(named.pose_format)
@@ -258,7 +265,12 @@ def _from_bag(source: Path, named: Named) -> Found:
         forward = _forward(cell, Path(model_file), named.joints)
     stream = bag.robot(robot, forward, named.direction)
     capture = stations_from_streams(stream, bag.images(topics), named.still)
-    return Found(capture, cell, cell_file, model_file, tuple(proposals))
+    change = named.tool_change
+    if change is None and cell.second_mount is not None:
+        change = _tool_change_of(bag)
+        if change is not None:
+            proposals.append(f"--tool-change {change}")
+    return Found(capture, cell, cell_file, model_file, tuple(proposals), change)
 
 
 def _cell_of(bag: BagFile, source: Path) -> tuple[CellToCalibrate, str, str]:
@@ -286,6 +298,15 @@ def _cell_of(bag: BagFile, source: Path) -> tuple[CellToCalibrate, str, str]:
             )
         model = str(storage.find_model(cell, source))
     return cell, str(source), model
+
+
+def _tool_change_of(bag: BagFile) -> int | None:
+    """The first station with the second mount, as an exported session carries it."""
+    try:
+        change = json.loads(bag.about() or "{}")["tool_change"]["before"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return change if type(change) is int else None
 
 
 def _forward(cell: Cell, model: Path, joints: Sequence[str]) -> Forward:
