@@ -33,6 +33,7 @@ from handeye_tri.storage import SessionFolder
 LIMITS = {
     "hp3_stereo": (0.078, 0.045, 0.030),
     "hp3_stereo_edge": (0.082, 0.052, 0.036),
+    "hp3_stereo_both": (0.082, 0.052, 0.036),
     "hp3_stereo_lens": (0.082, 0.047, 0.032),
     "hp3_stereo_mono": (None, None, None),
     "hp3_single": (None, None, None),
@@ -56,7 +57,8 @@ def command(*arguments: object) -> int:
 def noiseless(session: Session, truth: GroundTruth) -> Session:
     """The same stations with true poses and true centres of outlines."""
     poses = truth.base_from_flange
-    points = truth.markers @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
+    held = np.array([truth.markers, *(mount.markers for mount in truth.other_mounts)])
+    points = held[session.mounts] @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
     pixels = []
     for camera, place in zip(truth.cameras, truth.base_from_camera, strict=True):
         local = place.inverse().apply(points)

@@ -68,11 +68,13 @@ def _simulate(run: Run) -> list[str]:
         {"schema": TRUTH_SCHEMA, **codec.truth_to_json(truth, joints)},
     )
     rig, outputs = run.cell.rig, ["truth.json"]
+    held = [truth.markers, *(mount.markers for mount in truth.other_mounts)]
+    markers = [held[station.mount] for station in run.plan().stations]
     for camera, base_from_camera in zip(
         truth.cameras, truth.base_from_camera, strict=True
     ):
         for j, base_from_flange in enumerate(truth.base_from_flange):
-            points = truth.markers @ base_from_flange[:3, :3].T
+            points = markers[j] @ base_from_flange[:3, :3].T
             points = base_from_camera.inverse().apply(points + base_from_flange[:3, 3])
             image = draw(
                 camera,

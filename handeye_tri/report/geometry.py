@@ -26,6 +26,7 @@ def plane_directions(session: Session, calibration: HandEyeCalibration) -> str:
     centre = centres.mean(axis=0) - rig
     centre /= np.linalg.norm(centre)
     places = on_half_sphere(normals, centre)
+    made = session.mounts[[turn.before for turn in session.half_turns]]
 
     def draw(figure: Figure) -> None:
         ax = figure.subplots()
@@ -44,8 +45,20 @@ def plane_directions(session: Session, calibration: HandEyeCalibration) -> str:
                 ha="center",
                 va="bottom",
             )
-        ax.plot(*places.T, color=ESTIMATE, linewidth=0.5, alpha=0.5)
-        ax.plot(*places.T, "o", color=ESTIMATE, markersize=4.5)
+        for mount in np.unique(made):
+            own = places[made == mount]
+            ax.plot(*own.T, color=ESTIMATE, linewidth=0.5, alpha=0.5)
+            ax.plot(
+                *(*own.T, "osd"[mount % 3]),
+                color=ESTIMATE,
+                markersize=4.5,
+                markerfacecolor=ESTIMATE if mount == 0 else "white",
+                label=session.mount_name(int(mount)),
+            )
+        if made.any():
+            figure.legend(
+                loc="outside upper center", ncols=2, frameon=False, fontsize=7.5
+            )
         for turn_, place in zip(session.half_turns, places, strict=True):
             ax.annotate(
                 f"{turn_.before}-{turn_.after}",
@@ -81,8 +94,9 @@ def on_half_sphere(normals: Floats, towards_eye: Floats) -> Floats:
 def _plane_normals(session: Session, calibration: HandEyeCalibration) -> Floats:
     """Triangle normals before each half-turn in the base, shape (t, 3)."""
     before = session.base_from_flange[[turn.before for turn in session.half_turns]]
-    rotation = before[:, :3, :3] @ calibration.flange_from_triangle.rotation
-    return np.asarray(rotation[:, :, 2])
+    made = session.mounts[[turn.before for turn in session.half_turns]]
+    held = np.array([m.flange_from_triangle.rotation for m in calibration.mounts])
+    return np.asarray((before[:, :3, :3] @ held[made])[:, :, 2])
 
 
 def _screen_axes(towards_eye: Floats) -> tuple[Floats, Floats]:
@@ -97,14 +111,20 @@ def _screen_axes(towards_eye: Floats) -> tuple[Floats, Floats]:
 
 def frames(session: Session, calibration: HandEyeCalibration) -> str:
     """Where base, cameras and triangle stand, with their axes; drawn to scale."""
-    held_out = session.indices("evaluation")
-    j = int(held_out[0]) if len(held_out) else 0
-    base_from_triangle = (
-        session.stations[j].base_from_flange @ calibration.flange_from_triangle
-    )
+    held_out = session.indices("evaluation").tolist()
+    mounts, rigs = session.mounts, []
+    for k, mount in enumerate(calibration.mounts):
+        own = np.flatnonzero(mounts == k).tolist()
+        j = next((j for j in held_out if j in own), own[0])
+        pose = session.stations[j].base_from_flange @ mount.flange_from_triangle
+        name = f"triangle at station {j}"
+        if calibration.other_mounts:
+            name += f", mount {k + 1}"
+        rigs.append((name, pose.matrix))
+    cameras = 1 + len(rigs)
     places = [
         ("robot base", np.eye(4)),
-        (f"triangle at station {j}", base_from_triangle.matrix),
+        *rigs,
         *(
             (camera.name, motion.matrix)
             for camera, motion in zip(
@@ -114,7 +134,7 @@ def frames(session: Session, calibration: HandEyeCalibration) -> str:
     ]
     origins = np.array([pose[:3, 3] for _, pose in places])
     spread = float(np.linalg.norm(np.ptp(origins, axis=0)))
-    towards = origins[2:].mean(axis=0) - origins[1]
+    towards = origins[cameras:].mean(axis=0) - origins[1]
     side = np.cross([0.0, 0.0, 1.0], towards)
     eye = 0.35 * towards / np.linalg.norm(towards) - side / max(
         float(np.linalg.norm(side)), 1e-9
@@ -129,7 +149,7 @@ def frames(session: Session, calibration: HandEyeCalibration) -> str:
 
     def draw(figure: Figure) -> None:
         ax = figure.subplots()
-        for k in range(2, len(places)):
+        for k in range(cameras, len(places)):
             ax.plot(
                 *starts[[0, k]].T,
                 linestyle=(0, (2, 2)),

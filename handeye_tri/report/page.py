@@ -18,6 +18,7 @@ from handeye_tri.records import (
     HandEyeCalibration,
     Session,
     TrackEvaluation,
+    triangle_name,
 )
 from handeye_tri.report import figures, geometry, spreads, tables
 from handeye_tri.report.figures import Photograph
@@ -122,6 +123,7 @@ def render_report(
         ],
         others=tables.remaining(rows, session),
         positions=tables.track_rows(evaluation["track"], radii),
+        mounts=tables.station_mounts(session),
         checks=checks,
         far=sum(check.code == "FAR" for check in checks),
         factor=factor,
@@ -135,7 +137,7 @@ def render_report(
         assumptions=tables.assumptions(session, calibration),
         cameras=cameras,
         calibration=calibration,
-        half_turns=len(session.half_turns),
+        turns=tables.half_turn_words(session),
         used=len(session.indices("calibration")),
         # matplotlib escapes what it draws.
         figure={name: Markup(svg) for name, svg in drawings.items()},
@@ -180,16 +182,19 @@ def _motions(
                 "text": tables.motion_text(motion),
             }
         )
-    name = "flange_from_triangle"
-    found.append(
-        {
-            "name": name,
-            "title": "How the rig sits on the flange",
-            "words": "Takes a point from the triangle's frame (origin at A, x to B, "
-            "C on the side of +y) to the frame that the robot reports: "
-            f"p_flange = {name} p_triangle.",
-            "rows": tables.quantities(rows, name),
-            "text": tables.motion_text(calibration.flange_from_triangle),
-        }
-    )
+    for k, mount in enumerate(calibration.mounts):
+        name, title = triangle_name(k), "How the rig sits on the flange"
+        if calibration.other_mounts:
+            title += f", {session.mount_name(k)}"
+        found.append(
+            {
+                "name": name,
+                "title": title,
+                "words": "Takes a point from the triangle's frame (origin at A, x to "
+                "B, C on the side of +y) to the frame that the robot reports: "
+                f"p_flange = {name} p_triangle.",
+                "rows": tables.quantities(rows, name),
+                "text": tables.motion_text(mount.flange_from_triangle),
+            }
+        )
     return found

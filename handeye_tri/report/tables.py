@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.camera import PinholeCamera
-from handeye_tri.records import CameraInfo, HandEyeCalibration, Session, motion_labels
+from handeye_tri.counting import counted
+from handeye_tri.records import (
+    CameraInfo,
+    HandEyeCalibration,
+    Session,
+    motion_labels,
+    triangle_name,
+)
 from handeye_tri.se3 import SE3
 from handeye_tri.summary import digits
 
@@ -49,7 +56,7 @@ def quantities(rows: Sequence[Mapping[str, Any]], owner: str) -> list[Row]:
 
 def remaining(rows: Sequence[Mapping[str, Any]], session: Session) -> list[Row]:
     """What was estimated beyond cameras and motions, by its full name."""
-    shown = {"flange_from_triangle"}
+    shown = {triangle_name(mount) for mount in session.mounts.tolist()}
     for camera in session.cameras:
         shown |= {camera.name, f"base_from_{camera.name}"}
     return [
@@ -69,6 +76,22 @@ def _quantity(row: Mapping[str, Any], symbol: str) -> Row:
         "sigma": f"{sigma:.{digits(sigma)}f}",
         "truth": "" if error is None else number(-error, sigma, signed=True),
     }
+
+
+def station_mounts(session: Session) -> list[str]:
+    """The number of each station's mount, from 1; nothing where there is one mount."""
+    mounts = session.mounts
+    return [str(mount + 1) for mount in mounts] if mounts.any() else []
+
+
+def half_turn_words(session: Session) -> str:
+    """How many half-turns there are, with each mount where there are several."""
+    made = [session.stations[turn.before].mount for turn in session.half_turns]
+    text = counted(len(made), "half-turn")
+    if not session.mounts.any() or not made:
+        return text
+    parts = [f"{made.count(k)} with mount {k + 1}" for k in sorted(set(made))]
+    return f"{text}, {' and '.join(parts)}"
 
 
 def gates_worst_first(gates: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

@@ -10,7 +10,14 @@ from finished_session import evaluation, finished, photograph
 
 from handeye_tri.diagnose import Finding
 from handeye_tri.report import Origin, figures, geometry, render_report
-from handeye_tri.report.tables import gates_worst_first, number, quantities
+from handeye_tri.report.tables import (
+    gates_worst_first,
+    half_turn_words,
+    number,
+    quantities,
+    station_mounts,
+)
+from handeye_tri.synthesize import synthesize, two_mount_geometry
 
 ORIGIN = Origin(
     cell="hp3_stereo",
@@ -311,3 +318,15 @@ def test_what_else_was_estimated_is_listed_by_its_full_name(undrawn):
     assert "Also estimated" in text
     assert "marker_A.x" in text
     assert "Also estimated" not in text_of(page())
+
+
+def test_half_turns_are_counted_by_mount():
+    one = finished().session
+    assert (half_turn_words(one), station_mounts(one)) == ("5 half-turns", [])
+    geometry_ = two_mount_geometry(
+        np.random.default_rng(1), half_turns=2, evaluation_stations=1
+    )
+    both, _ = synthesize(geometry_, np.random.default_rng(2), sigma_px=0.0)
+    words = "4 half-turns, 2 with mount 1 and 2 with mount 2"
+    assert half_turn_words(both) == words
+    assert station_mounts(both) == ["1"] * 5 + ["2"] * 5
