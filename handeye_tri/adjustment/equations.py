@@ -21,10 +21,10 @@ Floats = NDArray[np.float64]
 CHUNK = 512
 
 
-def chunks(count: int) -> Iterator[slice]:
-    """Slices that cover ``range(count)``."""
-    for start in range(0, count, CHUNK):
-        yield slice(start, min(start + CHUNK, count))
+def chunks(stop: int, start: int = 0) -> Iterator[slice]:
+    """Slices that cover ``range(start, stop)``."""
+    for first in range(start, stop, CHUNK):
+        yield slice(first, min(first + CHUNK, stop))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,27 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri import arguments
-from handeye_tri.adjustment.model import AdjustmentModel, Linearisation
-from handeye_tri.adjustment.problem import Sides, State, Stations
-from handeye_tri.adjustment.result import adjustment_result, check_determined
+from handeye_tri.adjustment.linearisation import (
+    Linearisation,
+    evaluate,
+    normal_equations,
+)
+from handeye_tri.adjustment.model import AdjustmentModel
+from handeye_tri.adjustment.problem import Sides, State
+from handeye_tri.adjustment.result import (
+    adjustment_result,
+    check_determined,
+    check_seen,
+)
 from handeye_tri.adjustment.robot import RobotParameters, determined
 from handeye_tri.adjustment.robust import Loss
-from handeye_tri.calibrate_cameras.bundle_input import observations, pairs, unknowns
+from handeye_tri.adjustment.session_input import (
+    check_input,
+    error_root,
+    side_lengths,
+    start_state,
+    stations_in_blocks,
+)
+from handeye_tri.calibrate_cameras.bundle_input import unknowns
 from handeye_tri.calibrate_cameras.eccentricity import sphere_shift
 from handeye_tri.calibrate_cameras.least_squares import Minimum, minimise
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
 from handeye_tri.errors import ConvergenceError, DegenerateMotionError, InputError
-from handeye_tri.records import HandEyeCalibration, Repeatability, Session
+from handeye_tri.records import HandEyeCalibration, Session
 from handeye_tri.threads import one_thread
-from handeye_tri.triangle import EDGES
 
 Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 # Correlations of detection errors that are tried where markers lie on the axis.
 _CORRELATIONS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 0.96, 0.985)
@@ -46,7 +60,9 @@ def adjust(
     the flange truly stands at ``reported @ exp(xi)``, xi normal with the stated
     covariance (nothing is estimated where the robot is exact). Unknown are each
     camera's intrinsics and the lens coefficients that the session names, each
-    camera's place in the base, and the three markers in the flange frame. Nothing is
+    camera's place in the base, and the three markers in the flange frame, on each
+    mount of the triangle anew: its stations share the cameras and the base with all
+    others, and only tell of other markers. Nothing is
     left to choose: base and flange are the robot's own frames, its reported
     motions fix the scale, and where a correction common to all stations could trade
     against cameras or markers, the corrections' zero mean decides.
@@ -65,6 +81,7 @@ def adjust(
         side_sigma: How well the triangle's sides are known (each one standard
             deviation), metres: 0 for exact sides, infinite for markers that calibrate
             themselves, which costs hardly any accuracy and needs no measured rig.
+            On each mount the sides are off by themselves.
         loss: A robust loss, for wrong detections; None for the likelihood. chi2 is
             then the sum of that loss, and the covariance that of the points kept.
         robot_parameters: Systematic errors of the robot as further unknowns, at all
@@ -78,10 +95,11 @@ def adjust(
     Returns:
         The cell. ``covariance`` has the cameras, "reference_from_<camera>",
         "base_from_<camera>", "flange_from_triangle", the markers ("marker_A.x" ...
-        in the flange frame, metres) and the robot's parameters; it is singular, since
-        some follow from others. ``residuals`` are of the stations at which the
-        pixels alone fix the flange, see "stations". ``robot`` has the values of
-        the parameters that were freed. ``details`` has:
+        in the flange frame, metres), the same of other mounts
+        ("flange_from_triangle_2", "marker_A_2.x" ...) and the robot's parameters; it
+        is singular, since some follow from others. ``residuals`` are of the stations at
+        which the pixels alone fix the flange, see "stations". ``robot`` has the values
+        of the parameters that were freed. ``details`` has:
 
         - "pixel_residuals": detected less predicted, (m, n, 3, 2), NaN where unused;
         - "corrections": xi at every station, (n, 6), m and rad, NaN where unused;
@@ -92,11 +110,12 @@ def adjust(
         - "on_axis_correlation", "iterations", "condition".
 
     Raises:
-        InputError: session, start or an option do not fit.
+        InputError: session, start or an option do not fit, or a mount shows markers at
+            fewer than two stations.
         DegenerateMotionError: the data do not determine the unknowns; names them.
         ConvergenceError: the iteration did not settle.
     """
-    _check(session, start, side_sigma, loss, robot_parameters, on_axis_correlation)
+    check_input(session, start, side_sigma, loss, robot_parameters, on_axis_correlation)
     # Products of a few hundred numbers a side: threads cost more than they bring.
     with one_thread():
         return _adjusted(
@@ -115,7 +134,9 @@ def _adjusted(
     edge = any(turn.axis != "normal" for turn in session.half_turns)
     estimate = on_axis_correlation is None and edge
     correlation = 0.0 if on_axis_correlation is None else on_axis_correlation
-    stations = _stations(session, correlation if edge else 0.0, paired=estimate)
+    stations = stations_in_blocks(
+        session, correlation if edge else 0.0, paired=estimate
+    )
     inner, outer = unknowns(
         start.cameras,
         [info.skew for info in session.cameras],
@@ -126,12 +147,12 @@ def _adjusted(
         inner,
         outer,
         session.marker_radii,
-        Sides(_side_lengths(session), side_sigma),
-        _root(session.repeatability),
+        Sides(side_lengths(session), side_sigma),
+        error_root(session.repeatability),
         None,
         loss,
     )
-    state = _start(session, start, model)
+    state = start_state(session, start, model)
     undetermined: tuple[str, ...] = ()
     if robot_parameters is not None:
         model, state, undetermined = _free_robot(
@@ -141,118 +162,6 @@ def _adjusted(
     if estimate:
         correlation, end = _correlated(end, start.cameras)
     return adjustment_result(session, start, end, undetermined, correlation)
-
-
-def _check(
-    session: Session,
-    start: HandEyeCalibration,
-    side_sigma: float,
-    loss: Loss | None,
-    robot_parameters: RobotParameters | None,
-    on_axis_correlation: float | None,
-) -> None:
-    arguments.record("session", session, Session)
-    arguments.record("start", start, HandEyeCalibration)
-    names = tuple(camera.name for camera in start.cameras)
-    expected = tuple(info.name for info in session.cameras)
-    if names != expected:
-        raise InputError(
-            f"start has the cameras ({', '.join(names)}), the session "
-            f"({', '.join(expected)}); give them in the session's order"
-        )
-    if loss is not None:
-        arguments.record("loss", loss, Loss)
-    if not arguments.number("side_sigma", side_sigma) >= 0:
-        raise InputError(
-            f"side_sigma must be 0 or more (metres, or infinite), got {side_sigma}"
-        )
-    if on_axis_correlation is not None and not (
-        0 <= arguments.number("on_axis_correlation", on_axis_correlation) < 1
-    ):
-        raise InputError(
-            "on_axis_correlation must be at least 0 and below 1, "
-            f"got {on_axis_correlation}"
-        )
-    if robot_parameters is None:
-        return
-    arguments.record("robot_parameters", robot_parameters, RobotParameters)
-    n = len(session.stations)
-    if len(robot_parameters.jacobian) != n:
-        raise InputError(
-            f"robot_parameters must be of all {n} stations of the session, "
-            f"got {len(robot_parameters.jacobian)}"
-        )
-    owners = {label.rsplit(".", 1)[0] for label in robot_parameters.labels}
-    if owners & set(names):
-        raise InputError(
-            f"robot_parameters and cameras share the names "
-            f"{', '.join(sorted(owners & set(names)))}; rename the parameters"
-        )
-
-
-def _root(repeatability: Repeatability) -> Floats:
-    """Square root of the covariance of the robot's error without empty columns."""
-    sigma = np.repeat([repeatability.translation, repeatability.rotation], 3)
-    return np.diag(sigma)[:, sigma > 0]
-
-
-def _side_lengths(session: Session) -> Floats:
-    points = session.triangle.points
-    return np.array(
-        [np.linalg.norm(points[end] - points[start]) for start, end in EDGES.values()]
-    )
-
-
-def _stations(session: Session, correlation: float, *, paired: bool) -> Stations:
-    """Calibration stations that show a marker, in blocks of one or of half-turns."""
-    m, n = len(session.cameras), len(session.stations)
-    observed, whitener = observations(m, session.pixels, session.pixel_covariance)
-    seen = np.asarray(np.isfinite(observed).all(axis=-1))
-    held = session.indices("evaluation")
-    seen[:, held] = False
-    used = np.flatnonzero(seen.any(axis=(0, 2)))
-    for i, info in enumerate(session.cameras):
-        if not seen[i].any():
-            raise InputError(
-                f"camera {info.name!r} sees no marker at any calibration station; "
-                "leave it out, or add stations in its view"
-            )
-    if paired or correlation > 0:
-        turns = [turn for turn in session.half_turns if turn.axis != "normal"]
-        index, _, members = pairs(turns, used, n)
-        on_axis = np.zeros((len(index), 3), dtype=bool)
-        for block, member in enumerate(members):
-            on_axis[block, list(EDGES[turns[member].axis])] = True
-    else:
-        index, on_axis = used[:, None], None
-    present = index >= 0
-    reported = np.tile(np.eye(4), (*index.shape, 1, 1))
-    reported[present] = session.base_from_flange[index[present]]
-    usable = seen[:, index] & present[..., None]
-    return Stations(
-        np.where(usable[..., None], observed[:, index], 0.0),
-        np.where(usable[..., None, None], whitener[:, index], 0.0),
-        reported,
-        index,
-        on_axis,
-        correlation,
-    )
-
-
-def _start(
-    session: Session, start: HandEyeCalibration, model: AdjustmentModel
-) -> State:
-    markers = start.markers
-    if model.sides.exact:
-        markers = start.flange_from_triangle.apply(session.triangle.points)
-    return State(
-        np.array([camera.intrinsics.vector for camera in start.cameras]),
-        tuple(camera.lens.coefficients for camera in start.cameras),
-        np.array([motion.matrix for motion in start.base_from_camera]),
-        np.array(markers),
-        np.zeros(0),
-        np.zeros((model.blocks, model.own)),
-    )
 
 
 def _free_robot(
@@ -269,8 +178,8 @@ def _free_robot(
     whole = replace(end.blocks.model, robot=parameters)
     count = len(parameters.labels)
     at = replace(end.state, robot=np.zeros(count))
-    information = whole.equations(at).reduced()
-    extra = slice(whole.rig.stop, whole.shared)
+    information = normal_equations(whole, at).reduced()
+    extra = whole.extra
     information[extra, extra] -= np.diag(parameters.sigma**-2)
     others = information[: extra.start, : extra.start]
     both = information[: extra.start, extra]
@@ -325,7 +234,7 @@ def _with_bending(
 def _minimum(
     model: AdjustmentModel, state: State, cameras: Sequence[PinholeCamera]
 ) -> Minimum[State, Linearisation]:
-    first = model.evaluate(state)
+    first = evaluate(model, state)
     if first is None:
         raise InputError(
             "start puts a seen marker behind its camera; start from a better cell"
@@ -336,10 +245,11 @@ def _minimum(
             f"few for {first.unknowns} unknowns; add stations, or estimate fewer lens "
             "coefficients"
         )
+    check_seen(first, cameras)
     largest = float(np.abs(model.stations.pixels).max())
     whitest = float(np.abs(model.stations.whitener).max())
     rounding = float(np.finfo(float).eps * largest * whitest)
-    end = minimise(model.evaluate, model.retract, state, rounding)
+    end = minimise(partial(evaluate, model), model.retract, state, rounding)
     assert end is not None
     if not end.converged:
         check_determined(end, cameras)

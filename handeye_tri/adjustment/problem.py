@@ -21,7 +21,7 @@ class State:
         intrinsics: fx, fy, skew, cx, cy of each camera, shape (m, 5), pixels.
         lenses: Lens coefficients of each camera, (5,) or (8,).
         base_from_camera: Shape (m, 4, 4), metres.
-        markers: A, B, C in the flange frame, shape (3, 3), metres.
+        markers: A, B, C in the flange frame on each of k mounts, (k, 3, 3), metres.
         robot: Systematic errors of the robot, shape (p,).
         missed: u of each block's stations, shape (b, w l).
     """
@@ -77,6 +77,7 @@ class Stations:
         reported: base_from_flange as reported, (b, w, 4, 4), metres; the identity
             where a block has no second station.
         index: Station of the session, shape (b, w); -1 for none.
+        mounts: Which of the k mounts each block has, shape (b,), ascending.
         on_axis: Which markers a block's two stations see at the same place, since
             they lie on the axis of the half-turn, (b, 3); None for blocks of one.
         correlation: Of the detection errors of such a marker at the two.
@@ -88,6 +89,7 @@ class Stations:
     whitener: Floats
     reported: Floats
     index: NDArray[np.intp]
+    mounts: NDArray[np.intp]
     on_axis: Bools | None = None
     correlation: float = 0.0
     bending: Floats | None = None

@@ -8,18 +8,21 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.adjustment.model import AdjustmentModel, Linearisation
+from handeye_tri.adjustment.linearisation import Linearisation, whitened_rows
+from handeye_tri.adjustment.model import AdjustmentModel
 from handeye_tri.adjustment.problem import State
 from handeye_tri.adjustment.robust import apply_loss
 from handeye_tri.calibrate_cameras.least_squares import Minimum
 from handeye_tri.camera import INTRINSIC_NAMES, Intrinsics, Lens, PinholeCamera
 from handeye_tri.errors import DegenerateMotionError
 from handeye_tri.records import (
-    MARKER_LABELS,
     Covariance,
     HandEyeCalibration,
+    Mount,
     Session,
+    marker_labels,
     motion_labels,
+    triangle_name,
 )
 from handeye_tri.se3 import SE3, hat
 from handeye_tri.triangle import frame_by_markers, triangle_frame
@@ -43,8 +46,29 @@ def unknown_labels(
         labels += [f"{camera.name}.{INTRINSIC_NAMES[k]}" for k in model.intrinsics[i]]
         labels += [f"{camera.name}.{camera.lens.names[k]}" for k in model.lenses[i]]
         labels += motion_labels(f"base_from_{camera.name}")
-    labels += motion_labels("rig") if model.sides.exact else MARKER_LABELS
+    for mount in range(len(model.rigs)):
+        name = "rig" if mount == 0 else f"rig_{mount + 1}"
+        labels += motion_labels(name) if model.sides.exact else marker_labels(mount)
     return (*labels, *(() if model.robot is None else model.robot.labels))
+
+
+def check_seen(at: Linearisation, cameras: Sequence[PinholeCamera]) -> None:
+    """Refuse unknowns that no observation depends on.
+
+    Raises:
+        DegenerateMotionError: names them.
+    """
+    labels = unknown_labels(at.model, cameras)
+    _check_dependence(np.diagonal(at.equations().shared), labels)
+
+
+def _check_dependence(diagonal: Floats, labels: tuple[str, ...]) -> None:
+    if (diagonal <= 0).any():
+        lost = [labels[k] for k in np.flatnonzero(diagonal <= 0).tolist()]
+        raise DegenerateMotionError(
+            f"nothing in the data depends on {', '.join(lost)}; add stations that do, "
+            "or estimate fewer unknowns"
+        )
 
 
 def check_determined(
@@ -59,12 +83,7 @@ def check_determined(
     information = end.blocks.equations().reduced()
     diagonal = np.diagonal(information)
     labels = unknown_labels(end.blocks.model, cameras)
-    if (diagonal <= 0).any():
-        lost = [labels[k] for k in np.flatnonzero(diagonal <= 0)]
-        raise DegenerateMotionError(
-            f"nothing in the data depends on {', '.join(lost)}; add stations that do, "
-            "or estimate fewer unknowns"
-        )
+    _check_dependence(diagonal, labels)
     scale = 1.0 / np.sqrt(diagonal)
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     open_ = vectors[:, values * _MAX_CONDITION < values[-1]]
@@ -108,6 +127,7 @@ def adjustment_result(
     corrections[model.stations.index[present]] = model.missed(state, slice(None))[
         present
     ]
+    first, *others = (Mount(triangle_frame(m), m) for m in state.markers)
     return HandEyeCalibration(
         cameras=tuple(
             PinholeCamera(
@@ -119,8 +139,9 @@ def adjustment_result(
             for i, camera in enumerate(start.cameras)
         ),
         base_from_camera=tuple(SE3(motion) for motion in state.base_from_camera),
-        flange_from_triangle=triangle_frame(state.markers),
-        markers=state.markers,
+        flange_from_triangle=first.flange_from_triangle,
+        markers=first.markers,
+        other_mounts=tuple(others),
         covariance=Covariance(labels, 0.5 * (matrix + matrix.T)),
         chi2=end.cost,
         dof=end.blocks.observations - end.blocks.unknowns,
@@ -159,13 +180,13 @@ def _method(model: AdjustmentModel) -> str:
 
 
 def _chi2_parts(model: AdjustmentModel, state: State, cost: float) -> dict[str, float]:
-    sides = (
-        model.sides.residuals(state.markers)[0] if model.sides.count else np.empty(0)
+    sides = np.array(
+        [model.sides.residuals(m)[0] for m in state.markers if model.sides.count]
     )
     scaled = np.empty(0) if model.robot is None else state.robot / model.robot.sigma
     parts = {
         "chi2_robot": float(np.vdot(state.missed, state.missed)),
-        "chi2_sides": float(sides @ sides),
+        "chi2_sides": float(np.vdot(sides, sides)),
         "chi2_parameters": float(scaled @ scaled),
     }
     return {"chi2_pixels": cost - sum(parts.values()), **parts}
@@ -194,17 +215,18 @@ def _derived(
     for i, camera in enumerate(cameras):
         labels += motion_labels(f"base_from_{camera.name}")
         rows.append(places[i])
-    by_markers = eye[model.rig]
-    if model.sides.exact:
-        by_rig = np.concatenate(
-            [np.broadcast_to(np.eye(3), (3, 3, 3)), -hat(state.markers)], axis=-1
-        )
-        by_markers = by_rig.reshape(9, 6) @ by_markers
-    labels += [*motion_labels("flange_from_triangle"), *MARKER_LABELS]
-    rows += [frame_by_markers(state.markers) @ by_markers, by_markers]
+    for mount, (rig, markers) in enumerate(zip(model.rigs, state.markers, strict=True)):
+        by_markers = eye[rig]
+        if model.sides.exact:
+            by_rig = np.concatenate(
+                [np.broadcast_to(np.eye(3), (3, 3, 3)), -hat(markers)], axis=-1
+            )
+            by_markers = by_rig.reshape(9, 6) @ by_markers
+        labels += [*motion_labels(triangle_name(mount)), *marker_labels(mount)]
+        rows += [frame_by_markers(markers) @ by_markers, by_markers]
     if model.robot is not None:
         labels += model.robot.labels
-        rows.append(eye[model.rig.stop :])
+        rows.append(eye[model.extra])
     return tuple(labels), np.concatenate(rows)
 
 
@@ -217,7 +239,8 @@ def _station_residuals(
     tangent between robot chain and camera chain to first order.
 
     Returns:
-        Station indices (s,), tangents in the triangle's frame (s, 6), m and rad.
+        Station indices (s,), tangents in the frame of the triangle on the station's
+        mount (s, 6), m and rad.
     """
     width = model.stations.index.shape[1]
     every = slice(None)
@@ -227,7 +250,7 @@ def _station_residuals(
     size = free.own
     normal = np.zeros((model.blocks, size, size))
     gradient = np.zeros((model.blocks, size))
-    for chunk, _, _, rows in free.rows(at):
+    for chunk, _, _, rows in whitened_rows(free, at):
         apply_loss(rows, model.loss)
         flat = rows.reshape(len(rows), -1, rows.shape[-1])
         own = flat[..., :size]
@@ -247,7 +270,9 @@ def _station_residuals(
     )
     tangent = xi + step.reshape(-1, width, 6)
     ok = fixed[:, None] & ~unseen.reshape(-1, width, 6).any(axis=-1)
-    adjoint = triangle_frame(state.markers).inverse().adjoint()
+    for part, markers in zip(model.parts, state.markers, strict=True):
+        adjoint = triangle_frame(markers).inverse().adjoint()
+        tangent[part] = (tangent[part].reshape(-1, 6) @ adjoint.T).reshape(-1, width, 6)
     index = model.stations.index[ok]
     order = np.argsort(index)
-    return index[order], (tangent[ok] @ adjoint.T)[order]
+    return index[order], tangent[ok][order]

@@ -8,11 +8,20 @@ from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
 from handeye_tri.records import (
     Covariance,
     HandEyeCalibration,
+    Mount,
     Repeatability,
     Station,
+    marker_labels,
+    triangle_name,
 )
 from handeye_tri.se3 import SE3, se3_exp
-from handeye_tri.synthesize import Geometry, look_at, reference_geometry, synthesize
+from handeye_tri.synthesize import (
+    Geometry,
+    look_at,
+    reference_geometry,
+    synthesize,
+    two_mount_geometry,
+)
 
 ROBOT = Repeatability(3e-5, float(np.radians(0.005)))
 EXACT = Repeatability(0.0, 0.0)
@@ -39,9 +48,11 @@ def rough(truth, rng, size=1.0):
 
     frame = moved(truth.flange_from_triangle)
     points = truth.flange_from_triangle.inverse().apply(truth.markers)
+    places = tuple(moved(motion) for motion in truth.base_from_camera)
+    others = [moved(mount.flange_from_triangle) for mount in truth.other_mounts]
     return HandEyeCalibration(
         tuple(cameras),
-        tuple(moved(motion) for motion in truth.base_from_camera),
+        places,
         frame,
         frame.apply(points),
         Covariance(("left.fx",), np.eye(1)),
@@ -50,17 +61,19 @@ def rough(truth, rng, size=1.0):
         np.zeros((1, 6)),
         "drawn",
         {"shah": truth.base_from_camera[0]},
+        other_mounts=tuple(Mount(motion, motion.apply(points)) for motion in others),
     )
 
 
 def cell(seed=0, noise=1, **options):
-    """Session, truth and a rough start; options split between the two makers."""
-    made = {
-        key: options.pop(key)
-        for key in ("axis", "skew", "lens", "half_turns", "evaluation_stations")
-        if key in options
-    }
-    geometry = reference_geometry(np.random.default_rng([seed, 0]), **made)
+    """Session, truth and a rough start; options split between the two makers.
+
+    ``axes`` instead of ``axis``: two mounts, with as many stations each.
+    """
+    make = two_mount_geometry if "axes" in options else reference_geometry
+    keys = ("axis", "axes", "skew", "lens", "half_turns", "evaluation_stations")
+    made = {key: options.pop(key) for key in keys if key in options}
+    geometry = make(np.random.default_rng([seed, 0]), **made)
     session, truth = synthesize(
         geometry, np.random.default_rng([seed, noise]), **options
     )
@@ -118,9 +131,13 @@ def errors(found, truth):
     """Truth less estimate of the labelled quantities: tangents of motions."""
     values = {}
     first = truth.base_from_camera[0].inverse()
-    mine = found.base_from_camera[0].inverse()
-    motions = {"flange_from_triangle": (found.flange_from_triangle,
-                                        truth.flange_from_triangle)}  # fmt: skip
+    reference = found.base_from_camera[0].inverse()
+    true_first = Mount(truth.flange_from_triangle, truth.markers)
+    mounts = list(zip(found.mounts, (true_first, *truth.other_mounts), strict=True))
+    motions = {
+        triangle_name(k): (mine.flange_from_triangle, true.flange_from_triangle)
+        for k, (mine, true) in enumerate(mounts)
+    }
     for i, (a, b) in enumerate(zip(found.cameras, truth.cameras, strict=True)):
         names = ("fx", "fy", "skew", "cx", "cy", *a.lens.names)
         left = np.r_[a.intrinsics.vector, a.lens.coefficients]
@@ -129,13 +146,12 @@ def errors(found, truth):
             values[f"{a.name}.{name}"] = value
         pair = found.base_from_camera[i], truth.base_from_camera[i]
         motions[f"base_from_{a.name}"] = pair
-        motions[f"reference_from_{a.name}"] = mine @ pair[0], first @ pair[1]
+        motions[f"reference_from_{a.name}"] = reference @ pair[0], first @ pair[1]
     for owner, (a, b) in motions.items():
         tangent = (a.inverse() @ b).log()
         for name, value in zip(("x", "y", "z", "rx", "ry", "rz"), tangent, strict=True):
             values[f"{owner}.{name}"] = value
-    for k, letter in enumerate("ABC"):
-        for j, axis in enumerate("xyz"):
-            difference = truth.markers[k, j] - found.markers[k, j]
-            values[f"marker_{letter}.{axis}"] = difference
+    for k, (mine, true) in enumerate(mounts):
+        difference = (true.markers - mine.markers).ravel()
+        values |= dict(zip(marker_labels(k), difference, strict=True))
     return values

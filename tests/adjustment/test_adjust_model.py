@@ -1,34 +1,45 @@
 """Derivatives against differences, elimination against dense algebra."""
 
 from dataclasses import replace
+from functools import partial
 
 import adjust_scene
 import numpy as np
 import pytest
 
 from handeye_tri.adjustment.equations import CHUNK, ChunkedEquations
-from handeye_tri.adjustment.joint import _root, _side_lengths, _start, _stations
+from handeye_tri.adjustment.linearisation import (
+    evaluate,
+    normal_equations,
+    whitened_rows,
+)
 from handeye_tri.adjustment.model import AdjustmentModel
 from handeye_tri.adjustment.problem import Sides
 from handeye_tri.adjustment.robot import RobotParameters
 from handeye_tri.adjustment.robust import Loss
+from handeye_tri.adjustment.session_input import (
+    error_root,
+    side_lengths,
+    start_state,
+    stations_in_blocks,
+)
 from handeye_tri.calibrate_cameras.least_squares import NormalEquations, minimise
 
 
 def built(session, start, *, side_sigma=np.inf, correlation=0.0, **options):
     """Model and start of a session, all intrinsics and k1, p2 free."""
-    stations = _stations(session, correlation, paired=correlation > 0)
+    stations = stations_in_blocks(session, correlation, paired=correlation > 0)
     m = len(session.cameras)
     model = AdjustmentModel(
         stations,
         ((0, 1, 2, 3, 4),) * m,
         ((0, 3),) * m,
         session.marker_radii,
-        Sides(_side_lengths(session), side_sigma),
-        _root(session.repeatability),
+        Sides(side_lengths(session), side_sigma),
+        error_root(session.repeatability),
         **options,
     )
-    state = _start(session, start, model)
+    state = start_state(session, start, model)
     if model.robot is not None:
         state = replace(state, robot=np.zeros(len(model.robot.labels)))
     return model, state
@@ -39,7 +50,8 @@ def stacked(model, state):
     size = model.own
     width = model.blocks * size
     parts = []
-    for chunk, _, place, rows in model.rows(state):
+    for chunk, i, mount, rows in whitened_rows(model, state):
+        place = np.r_[model.columns[i], model.rigs[mount], model.extra]
         rows = rows.reshape(len(rows), -1, rows.shape[-1])
         for offset, block in enumerate(range(chunk.start, chunk.stop)):
             dense = np.zeros((rows.shape[1], width + model.shared + 1))
@@ -58,11 +70,12 @@ def with_priors(model, state):
     rows = [np.eye(own, jacobian.shape[1])]
     values = [state.missed.ravel()]
     if model.sides.count:
-        value, slope = model.sides.residuals(state.markers)
-        row = np.zeros((3, jacobian.shape[1]))
-        row[:, own + model.rig.start : own + model.rig.stop] = slope
-        rows.append(row)
-        values.append(value)
+        for rig, markers in zip(model.rigs, state.markers, strict=True):
+            value, slope = model.sides.residuals(markers)
+            row = np.zeros((3, jacobian.shape[1]))
+            row[:, own + rig.start : own + rig.stop] = slope
+            rows.append(row)
+            values.append(value)
     return np.concatenate([residual, *values]), np.concatenate([jacobian, *rows])
 
 
@@ -90,6 +103,10 @@ CASES = {
     "pairs": {"axis": "CA", "correlation": 0.4},
     "parameters": {"parameters": True},
     "kinematics": {"parameters": True, "nonlinear": True, "side_sigma": 0.0},
+    "two mounts": {"axes": ("normal", "BC")},
+    "two mounts, exact sides": {"axes": ("CA", "AB"), "side_sigma": 0.0},
+    "two mounts, pairs": {"axes": ("BC", "normal"), "correlation": 0.4},
+    "two mounts, parameters": {"axes": ("normal", "normal"), "parameters": True},
 }
 
 
@@ -144,7 +161,7 @@ def test_cost_is_the_sum_of_squares_of_the_rows():
     )
     model, state = built(session, start, side_sigma=1e-4, correlation=0.5)
     state = replace(state, missed=np.random.default_rng(0).normal(size=(4, 12)))
-    linear = model.evaluate(state)
+    linear = evaluate(model, state)
     residual, _ = with_priors(model, state)
     assert linear.cost == pytest.approx(residual @ residual, rel=1e-12)
     # 8 stations x 3 markers x 2 cameras x 2, six a station, three sides.
@@ -152,13 +169,37 @@ def test_cost_is_the_sum_of_squares_of_the_rows():
     assert linear.unknowns == 48 + 2 * 13 + 9
 
 
-def test_normal_equations_are_those_of_the_rows():
+def test_each_mount_has_its_own_sides_and_markers():
     session, _, start = adjust_scene.cell(
-        2, sigma_px=0.1, repeatability=adjust_scene.ROBOT, half_turns=4
+        1,
+        axes=("CA", "normal"),
+        sigma_px=0.1,
+        repeatability=adjust_scene.ROBOT,
+        half_turns=4,
+    )
+    model, state = built(session, start, side_sigma=1e-4, correlation=0.5)
+    # Blocks of half-turns about CA, then stations of the other mount by themselves.
+    assert model.stations.mounts.tolist() == 4 * [0] + 8 * [1]
+    assert (model.stations.index[:, 1] >= 0).tolist() == 4 * [True] + 8 * [False]
+    assert model.stations.on_axis.sum(axis=1).tolist() == 4 * [2] + 8 * [0]
+    missed = np.random.default_rng(0).normal(size=(12, 12))
+    missed[4:, 6:] = 0.0
+    state = replace(state, missed=missed)
+    linear = evaluate(model, state)
+    residual, _ = with_priors(model, state)
+    assert linear.cost == pytest.approx(residual @ residual, rel=1e-12)
+    assert linear.observations == 2 * 96 + 6 * 16 + 2 * 3
+    assert linear.unknowns == 6 * 16 + 2 * 13 + 2 * 9
+
+
+@pytest.mark.parametrize("mounts", [{}, {"axes": ("normal", "BC")}])
+def test_normal_equations_are_those_of_the_rows(mounts):
+    session, _, start = adjust_scene.cell(
+        2, sigma_px=0.1, repeatability=adjust_scene.ROBOT, half_turns=4, **mounts
     )
     model, state = built(session, start, side_sigma=1e-4)
     residual, jacobian = with_priors(model, state)
-    found = model.equations(state)
+    found = normal_equations(model, state)
     own = model.blocks * model.own
     normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
     scale = np.sqrt(np.diagonal(normal))
@@ -203,17 +244,17 @@ def test_the_same_minimum_as_a_dense_solver_at_100_stations():
     rng = np.random.default_rng(8)
     session, truth = adjust_scene.ring(2, 100, rng)
     start = adjust_scene.rough(truth, rng)
-    stations = _stations(session, 0.0, paired=False)
+    stations = stations_in_blocks(session, 0.0, paired=False)
     model = AdjustmentModel(
         stations,
         ((0, 1, 3, 4),) * 2,
         ((),) * 2,
         session.marker_radii,
-        Sides(_side_lengths(session), np.inf),
-        _root(session.repeatability),
+        Sides(side_lengths(session), np.inf),
+        error_root(session.repeatability),
     )
-    state = _start(session, start, model)
-    end = minimise(model.evaluate, model.retract, state, 0.0)
+    state = start_state(session, start, model)
+    end = minimise(partial(evaluate, model), model.retract, state, 0.0)
     dense = state
     own = model.blocks * 6
     for _ in range(7):
@@ -245,12 +286,12 @@ def test_a_loss_has_the_gradient_of_its_cost(loss):
         4, sigma_px=0.1, repeatability=adjust_scene.ROBOT, half_turns=3
     )
     model, state = built(session, start, loss=loss)
-    gradient = model.equations(state).shared_gradient
-    for column, h in ((0, 1e-3), (9, 1e-6), (model.rig.start, 1e-6)):
+    gradient = normal_equations(model, state).shared_gradient
+    for column, h in ((0, 1e-3), (9, 1e-6), (model.rigs[0].start, 1e-6)):
         step = np.zeros(model.shared)
         step[column] = h
         zero = np.zeros((model.blocks, model.own))
-        plus = model.evaluate(model.retract(state, zero, step)).cost
-        minus = model.evaluate(model.retract(state, zero, -step)).cost
+        plus = evaluate(model, model.retract(state, zero, step)).cost
+        minus = evaluate(model, model.retract(state, zero, -step)).cost
         # The cost is the square: twice J'r.
         assert (plus - minus) / (4 * h) == pytest.approx(gradient[column], rel=1e-4)

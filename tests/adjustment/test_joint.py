@@ -12,7 +12,7 @@ from handeye_tri.calibrate_cameras import calibrate_session_cameras
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.evaluate import evaluate_track
 from handeye_tri.hand_eye import calibrate_hand_eye
-from handeye_tri.records import HalfTurn
+from handeye_tri.records import MARKER_LABELS, HalfTurn
 from handeye_tri.se3 import SE3
 from handeye_tri.triangle import TriangleRig
 
@@ -26,6 +26,15 @@ EXACT_CASES = {
     "edge": ({"axis": "CA"}, {}),
     "edge, correlated": ({"axis": "CA"}, {"on_axis_correlation": 0.5}),
     "robust": ({}, {"loss": Loss("cauchy", 2.0)}),
+    "two mounts": ({"axes": ("normal", "BC"), "half_turns": 6}, {}),
+    "two mounts, exact sides": (
+        {"axes": ("normal", "normal"), "half_turns": 6},
+        {"side_sigma": 0.0},
+    ),
+    "two mounts, correlated": (
+        {"axes": ("CA", "normal"), "half_turns": 6},
+        {"on_axis_correlation": 0.5},
+    ),
 }
 
 
@@ -43,7 +52,7 @@ def test_exact_data_give_the_exact_cell(name):
     for label, error in off.items():
         assert abs(error) < (1e-6 if label.split(".")[0] in ("left", "right") else 1e-9)
     assert np.abs(found.residuals).max() < 1e-9
-    assert found.residuals.shape == (22, 6)
+    assert found.residuals.shape == (2 * len(session.half_turns), 6)
     assert evaluate_track(found, session).max < 1e-9
 
 
@@ -236,6 +245,83 @@ def test_correlated_errors_on_the_axis_are_found():
     ] == pytest.approx(0.0)
 
 
+def test_a_second_mount_has_labels_of_its_own_in_order():
+    session, _, start = adjust_scene.cell(
+        0, axes=("normal", "BC"), sigma_px=0.1, half_turns=4
+    )
+    found = adjust(session, start)
+    owners = list(dict.fromkeys(x.split(".")[0] for x in found.covariance.labels))
+    first = ["flange_from_triangle", "marker_A", "marker_B", "marker_C"]
+    assert owners[-8:] == [*first, *(f"{owner}_2" for owner in first)]
+    (second,) = found.other_mounts
+    # The frame of each mount's triangle is built on its own markers.
+    local = second.flange_from_triangle.inverse().apply(second.markers)
+    assert np.abs(local[0]).max() < 1e-12
+    assert np.abs(local[1, 1:]).max() < 1e-12
+    assert local[2, 1] > 0
+    assert abs(local[2, 2]) < 1e-12
+
+
+def test_both_mounts_together_tell_more_of_the_cameras_than_each_alone():
+    session, _, start = adjust_scene.cell(0, axes=("normal", "BC"), sigma_px=0.0)
+    session = replace(session, repeatability=adjust_scene.ROBOT)
+    both = adjust(session, start, on_axis_correlation=0.3)
+    shared = [
+        label
+        for label in both.covariance.labels
+        if label.startswith(("left", "right", "base_from"))
+    ]
+    std = np.sqrt(np.diagonal(both.covariance.block(shared)))
+    total = np.zeros((len(shared), len(shared)))
+    for mount in (0, 1):
+        hidden = np.zeros(session.pixels.shape[:3], dtype=bool)
+        hidden[:, session.mounts != mount] = True
+        # Stations with the other mount say nothing then, so its markers are left out.
+        alone = replace(
+            adjust_scene.hide(session, hidden),
+            stations=tuple(replace(s, mount=0) for s in session.stations),
+        )
+        chosen = start.mounts[mount]
+        single = adjust(
+            alone,
+            replace(
+                start,
+                flange_from_triangle=chosen.flange_from_triangle,
+                markers=chosen.markers,
+                other_mounts=(),
+            ),
+            on_axis_correlation=0.3,
+        )
+        own = single.covariance.block(shared)
+        assert (np.diagonal(own) > 1.2 * std**2).all()
+        total += np.linalg.inv(own / np.outer(std, std))
+    # Each mount's markers eliminated, what the mounts tell of the cameras adds up.
+    np.testing.assert_allclose(
+        np.linalg.inv(total), both.covariance.block(shared) / np.outer(std, std),
+        atol=1e-6,
+    )  # fmt: skip
+
+
+def test_a_mount_that_shows_too_little_is_named():
+    session, _, start = adjust_scene.cell(
+        0, axes=("normal", "BC"), sigma_px=0.1, half_turns=4
+    )
+    hidden = np.zeros(session.pixels.shape[:3], dtype=bool)
+    hidden[:, session.mounts == 1] = True
+    with pytest.raises(InputError, match="mount 2 .* at 0 calibration stations.*add"):
+        adjust(adjust_scene.hide(session, hidden), start)
+    hidden[0, 11, 1] = False
+    with pytest.raises(InputError, match="mount 2 .* at 1 calibration station,"):
+        adjust(adjust_scene.hide(session, hidden), start)
+    hidden[0, 12:14, 1] = False
+    with pytest.raises(DegenerateMotionError, match="on marker_A_2.x, .*marker_C_2.z;"):
+        adjust(adjust_scene.hide(session, hidden), start)
+    with pytest.raises(DegenerateMotionError, match="open: rig_2 trade"):
+        adjust(adjust_scene.hide(session, hidden), start, side_sigma=0.0)
+    with pytest.raises(InputError, match="start knows 1 mount .* have 2;"):
+        adjust(session, replace(start, other_mounts=()))
+
+
 def test_motion_about_one_axis_names_what_it_leaves_open():
     session, truth = adjust_scene.ring(2, 20, np.random.default_rng(0), 0.0)
     about = [SE3.exp((0, 0, 0, 0, 0, angle)) for angle in np.linspace(-0.6, 0.6, 20)]
@@ -296,24 +382,40 @@ def test_what_does_not_fit_is_named():
     [
         ({"sigma_px": 0.1, "repeatability": adjust_scene.ROBOT}, {}),
         ({"sigma_px": 0.03}, {"side_sigma": 0.0}),
+        (
+            {
+                "sigma_px": 0.1,
+                "repeatability": adjust_scene.ROBOT,
+                "axes": ("normal", "BC"),
+                "half_turns": 6,
+            },
+            {"on_axis_correlation": 0.0},
+        ),
     ],
 )
 def test_errors_are_as_large_as_predicted(options, chosen):
     """30 draws; one NEES per unknown is then known to 4 to 6 %, a ratio to 10 %."""
     trials = 30
     nees, tracks, predicted, chi2 = [], [], [], []
-    blocks = ("left", "right", "base_from_left", "base_from_right",
-              "flange_from_triangle", "marker")  # fmt: skip
+    blocks = ["left", "right", "base_from_left", "base_from_right",
+              "flange_from_triangle", "marker"]  # fmt: skip
+    if "axes" in options:
+        blocks += ["flange_from_triangle_2", "marker_A_2", "marker_B_2", "marker_C_2"]
     for trial in range(trials):
         session, truth, start = adjust_scene.cell(
-            trial % 5, noise=100 + trial, skew=0.0, estimate_skew=False, **options
+            trial % 5, noise=100 + trial, estimate_skew=False, **options
         )
         found = adjust(session, start, **chosen)
         off = adjust_scene.errors(found, truth)
         row = []
         for block in blocks:
-            labels = [x for x in found.covariance.labels if x.startswith(block)]
-            if block == "marker" and chosen:
+            labels = [
+                x
+                for x in found.covariance.labels
+                if x.split(".")[0] == block
+                or (block == "marker" and x in MARKER_LABELS)
+            ]
+            if block == "marker" and "side_sigma" in chosen:
                 # A rigid triangle: nine coordinates, six unknowns.
                 labels = labels[:3]
             error = np.array([off[label] for label in labels])
