@@ -136,10 +136,10 @@ def _held(story: Story) -> list[str]:
     starts = [(0, story.mounts[0]), *changes_of_mount(story)]
     ends = [*(j for j, _ in starts[1:]), len(story.mounts)]
     spans = [
-        f"{start}-{end - 1} {name}"
+        f"{start}-{end - 1}: {name}"
         for (start, name), end in zip(starts, ends, strict=True)
     ]
-    return [f"Stations {', '.join(spans)}.", ""] if len(spans) > 1 else []
+    return [f"Stations {'; '.join(spans)}.", ""] if len(spans) > 1 else []
 
 
 def _unseen(story: Story, j: int) -> str:
@@ -167,8 +167,10 @@ def _findings(findings: Sequence[Mapping[str, Any]]) -> list[str]:
 def _legend(story: Story) -> str:
     truth = " **Grey**: the truth." if story.actual is not None else ""
     turns = [turn for view in story.turns for turn in view if turn.lines]
-    by_edge = {turn.edge is not None for turn in turns}
-    lines = " ".join(_LINES[edge] for edge in sorted(by_edge))
+    kinds = sorted({turn.edge is not None for turn in turns})
+    lines = " ".join(_LINES[by_edge] for by_edge in kinds)
+    if len(kinds) > 1:
+        lines = f"About a normal: {_LINES[False]} About an edge: {_LINES[True]}"
     return (
         "**Blue**: what was calibrated, and the stations it used. **Orange**: held "
         f"out.{truth}\n\nImages: o where a marker is seen, + where calibration and "
@@ -306,7 +308,7 @@ def log_lines(story: Story, evaluation: Mapping[str, Any]) -> list[LogLine]:
             )
             lines.append(LogLine(check.station, "WARN", text))
     for j, now in changes_of_mount(story):
-        lines.append(LogLine(j, "INFO", f"tool change: from here on {now}"))
+        lines.append(LogLine(j, "INFO", f"tool change: {now}"))
     for j, held_out in enumerate(story.held_out):
         marker, gap = story.worst(j)
         kind = "held out" if held_out else "used"

@@ -26,6 +26,10 @@ Floats = NDArray[np.float64]
 Photograph = Callable[[str, int], NDArray[np.uint8]]
 
 
+# So many stations have room for the word above each.
+_ROOMY = 8
+
+
 def held_out_track(track: TrackEvaluation, radii_95_mm: Sequence[float]) -> str:
     """Robot-reported and observed positions, and their distance, row by row.
 
@@ -76,10 +80,20 @@ def held_out_track(track: TrackEvaluation, radii_95_mm: Sequence[float]) -> str:
                 ax.axvline(edge, color="#999999", linewidth=0.5)
         axes[3].set_xticks(rows, [VERTICES[k] for k in track.markers])
         ends = np.concatenate([[-0.5], edges, [len(rows) - 0.5]])
+        # The word before each number only where there is room for it.
+        roomy = len(edges) < _ROOMY
+        if not roomy:
+            axes[0].text(
+                *(-0.01, 1.03, "station"),
+                transform=axes[0].transAxes,
+                ha="right",
+                fontsize=7,
+            )
         for start, end in zip(ends, ends[1:], strict=False):
             station = int(track.stations[round(start + 0.5)])
             axes[0].text(
-                *(0.5 * (start + end), 1.03, f"station {station}"),
+                *(0.5 * (start + end), 1.03),
+                f"station {station}" if roomy else str(station),
                 transform=axes[0].get_xaxis_transform(),
                 ha="center",
                 fontsize=7,

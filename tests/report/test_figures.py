@@ -7,6 +7,7 @@ import pytest
 from finished_session import finished
 
 from handeye_tri.evaluate.views import predicted_pixels
+from handeye_tri.records import TrackEvaluation
 from handeye_tri.report import figures, geometry
 
 
@@ -31,6 +32,23 @@ def test_bars_are_as_high_as_the_distances():
     ratio = heights / track.distances
     assert np.allclose(ratio, ratio[0], rtol=1e-4)
     assert words(svg).count("A") == len(set(track.stations.tolist()))
+
+
+def test_many_stations_are_named_by_their_numbers_alone():
+    track = finished().track
+    few = words(figures.held_out_track(track, [0.1] * len(track.stations)))
+    assert f"station {track.stations[0]}" in few
+    numbers = np.repeat(np.arange(20, 29), 3)
+    rows = np.resize(np.arange(len(track.stations)), 27)
+    many = TrackEvaluation(
+        numbers,
+        np.tile([0, 1, 2], 9),
+        *(track.reported[rows], track.observed[rows]),
+        track.predicted_covariance[rows],
+    )
+    text = words(figures.held_out_track(many, [0.1] * 27))
+    assert text.count("station") == 1
+    assert {str(station) for station in range(20, 29)} <= set(text)
 
 
 def test_shares_of_the_budget_are_of_its_square():
