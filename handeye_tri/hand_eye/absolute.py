@@ -93,7 +93,7 @@ def solve_axzb(
             refine_axzb(
                 left,
                 right,
-                x,
+                (x,),
                 z,
                 _covariances("covariance_a", covariance_a, n)[kept],
                 _covariances("covariance_b", covariance_b, n)[kept],
@@ -229,7 +229,7 @@ def _refine_unknown_noise(a: Floats, b: Floats, x: SE3, z: SE3) -> Refinement:
     sigma = np.array([1e-3, 1e-3])
     for _ in range(_ROUNDS):
         covariance = np.diag(np.repeat(sigma**2, 3))
-        refinement = refine_axzb(a, b, x, z, np.zeros((6, 6)), covariance)
+        refinement = refine_axzb(a, b, (x,), z, np.zeros((6, 6)), covariance)
         parts = refinement.residuals.reshape(-1, 2, 3)
         # Of 6 n residuals 12 degrees of freedom went into X and Z.
         share = max(len(a) - 2, 1)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri import arguments
+from handeye_tri.counting import counted
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.hand_eye.absolute import solve_axzb
 from handeye_tri.hand_eye.motions import relative_motions
@@ -19,14 +19,17 @@ from handeye_tri.records import (
     CameraCalibration,
     Covariance,
     HandEyeCalibration,
+    Mount,
     Session,
     motion_labels,
+    triangle_name,
 )
-from handeye_tri.se3 import SE3
+from handeye_tri.se3 import SE3, se3_inverse
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
-# Up to here the alternatives use all pairs of stations, beyond it successive ones:
+# Up to here all pairs of stations with one mount are used, beyond it successive ones:
 # their number grows with the square.
 _ALL_PAIRS = 100
 
@@ -39,6 +42,12 @@ def calibrate_hand_eye(
     At each calibration station the known triangle's pose is fitted to all cameras'
     pixels; then AX = ZB in closed form (Shah 2013) and by maximum likelihood,
     weighed by the robot's repeatability and by each pose's own covariance.
+
+    Where the triangle changes its mount, each mount has its own X and all share one Z.
+    Relative motions in the base, between stations with the same mount, do not depend on
+    X: those of all mounts together give Z in closed form (AX = XB, Park and Martin
+    1994) and decide whether it is determined. Every X follows from its stations, and
+    maximum likelihood refines all at once.
 
     The covariance holds the cameras' parameters too, consistently: an error of the
     cameras moves every pose and through them both motions; this is propagated
@@ -60,7 +69,8 @@ def calibrate_hand_eye(
 
     Raises:
         InputError: cameras and session do not fit, or fewer than three calibration
-            stations show all markers to two cameras (or to the only one).
+            stations show all markers to two cameras (or to the only one), or fewer
+            than two do with one of several mounts; names the mount.
         DegenerateMotionError: the stations do not determine the motions.
         ConvergenceError: an iteration did not settle.
     """
@@ -94,29 +104,73 @@ def calibrate_hand_eye(
         )
     a = session.base_from_flange[stations[observed.views]]
     b = observed.reference_from_triangle
-    flange_from_triangle, base_from_reference = solve_axzb(a, b)
+    mounts = session.mounts[stations[observed.views]]
+    _check_mounts(mounts, 1 + int(session.mounts.max()))
+    xs, z = _closed_form(a, b, mounts)
     refined = refine_axzb(
-        a,
-        b,
-        flange_from_triangle,
-        base_from_reference,
-        session.repeatability.covariance,
-        observed.covariance,
+        a, b, xs, z, session.repeatability.covariance, observed.covariance, mounts
     )
+    first, *others = (Mount(x, x.apply(session.triangle.points)) for x in refined.xs)
     return HandEyeCalibration(
         cameras=cameras.cameras,
         base_from_camera=tuple(
             refined.z @ motion for motion in cameras.reference_from_camera
         ),
-        flange_from_triangle=refined.x,
-        markers=refined.x.apply(session.triangle.points),
+        flange_from_triangle=first.flange_from_triangle,
+        markers=first.markers,
+        other_mounts=tuple(others),
         covariance=_joint_covariance(cameras, observed, refined),
         chi2=_chi2(cameras, observed, refined),
-        dof=6 * len(a) - 12,
+        dof=6 * len(a) - len(refined.covariance),
         residuals=refined.residuals,
-        method="AX=ZB: Shah, then maximum likelihood",
-        alternatives=_alternatives(a, b),
+        method="AX=ZB: Shah, then maximum likelihood"
+        if len(xs) == 1
+        else f"AX=ZB with {len(xs)} X: Park and Martin, then maximum likelihood",
+        alternatives=_alternatives(a, b, mounts),
     )
+
+
+def _check_mounts(mounts: Indices, count: int) -> None:
+    """Refuse mounts that have too few of the stations used, mounts of shape (n,)."""
+    used = np.bincount(mounts, minlength=count)
+    if count > 1 and used.min() < 2:
+        raise InputError(
+            f"mount {1 + int(used.argmin())} of the triangle has "
+            f"{counted(int(used.min()), 'calibration station')} with all three markers "
+            "in two cameras (or in the only one, in a half-turn), and each mount needs "
+            "2 or more; add stations with it, or leave its stations out"
+        )
+
+
+def _closed_form(a: Floats, b: Floats, mounts: Indices) -> tuple[list[SE3], SE3]:
+    """The X of each mount and Z of ``a_i X = Z b_i``, mounts of shape (n,)."""
+    if not mounts.any():
+        x, z = solve_axzb(a, b)
+        return [x], z
+    z = solve_axxb(*_relative(a, b, mounts))
+    xs = se3_inverse(a) @ z.matrix @ b
+    return [
+        SE3.mean([SE3(x) for x in xs[mounts == mount]])
+        for mount in range(1 + int(mounts.max()))
+    ], z
+
+
+def _relative(a: Floats, b: Floats, mounts: Indices) -> tuple[Floats, Floats]:
+    """Motions in the base between stations with the same mount, as each side has it."""
+    parts = [np.flatnonzero(mounts == mount) for mount in range(1 + int(mounts.max()))]
+    left, right = (
+        np.concatenate(
+            [
+                relative_motions(
+                    poses[part],
+                    pairs="all" if len(part) <= _ALL_PAIRS else "successive",
+                )
+                for part in parts
+            ]
+        )
+        for poses in (a, b)
+    )
+    return left, right
 
 
 def _rough(
@@ -131,13 +185,13 @@ def _joint_covariance(
     cameras: CameraCalibration, observed: ObservedPoses, refined: Refinement
 ) -> Covariance:
     """Covariance of the cameras' parameters and of all motions in the base."""
-    p = len(cameras.covariance.labels)
-    # Everything is linear in (camera parameters, statistical error of X and Z).
-    by_sources = np.zeros((p + 12, p + 12))
+    p, q = len(cameras.covariance.labels), len(refined.covariance)
+    # Everything is linear in (camera parameters, statistical error of every X and Z).
+    by_sources = np.zeros((p + q, p + q))
     by_sources[:p, :p] = np.eye(p)
     by_sources[p:, :p] = np.einsum("tni,nip->tp", refined.by_b, observed.by_cameras)
-    by_sources[p:, p:] = np.eye(12)
-    of_x, of_z = by_sources[p : p + 6], by_sources[p + 6 :]
+    by_sources[p:, p:] = np.eye(q)
+    of_xs, of_z = by_sources[p:-6], by_sources[-6:]
     rows, labels = [by_sources[:p]], list(cameras.covariance.labels)
     for i, (camera, motion) in enumerate(
         zip(cameras.cameras, cameras.reference_from_camera, strict=True)
@@ -149,10 +203,11 @@ def _joint_covariance(
             row[:, [labels.index(name) for name in names]] += np.eye(6)
         rows.append(row)
         labels.extend(motion_labels(f"base_from_{camera.name}"))
-    rows.append(of_x)
-    labels.extend(motion_labels("flange_from_triangle"))
+    rows.append(of_xs)
+    for mount in range(len(refined.xs)):
+        labels.extend(motion_labels(triangle_name(mount)))
     total = np.concatenate(rows)
-    sources = np.zeros((p + 12, p + 12))
+    sources = np.zeros((p + q, p + q))
     sources[:p, :p] = cameras.covariance.matrix
     sources[p:, p:] = refined.covariance
     matrix = total @ sources @ total.T
@@ -176,23 +231,23 @@ def _chi2(
     design = np.concatenate([refined.gradient, by_y], axis=2)
     weighted = np.swapaxes(design, 1, 2) @ refined.precision
     normal = np.einsum("npi,niq->pq", weighted, design)
-    normal[12:, 12:] += np.eye(len(std))
+    q = len(refined.covariance)
+    normal[q:, q:] += np.eye(len(std))
     right = np.einsum("npi,ni->p", weighted, refined.residuals)
     scale = 1.0 / np.sqrt(np.diagonal(normal))
     solution = scale * np.linalg.solve(normal * scale[:, None] * scale, scale * right)
     return float(refined.chi2 - right @ solution)
 
 
-def _alternatives(a: Floats, b: Floats) -> dict[str, SE3]:
-    """base_from_<first camera> by every other solver."""
+def _alternatives(a: Floats, b: Floats, mounts: Indices) -> dict[str, SE3]:
+    """base_from_<first camera> by every other solver; AX = ZB knows but one mount."""
     found: dict[str, SE3] = {}
-    pairs: Literal["all", "successive"] = (
-        "all" if len(a) <= _ALL_PAIRS else "successive"
-    )
-    left, right = (relative_motions(poses, pairs=pairs) for poses in (a, b))
+    left, right = _relative(a, b, mounts)
     for method in RELATIVE_METHODS:
         with contextlib.suppress(DegenerateMotionError):
             found[method] = solve_axxb(left, right, method=method)
+    if mounts.any():
+        return found
     found["shah"] = solve_axzb(a, b)[1]
     with contextlib.suppress(DegenerateMotionError):
         found["li"] = solve_axzb(a, b, method="li")[1]

@@ -1,6 +1,7 @@
 """Maximum-likelihood AX = ZB with stated covariances of both sides.
 
-Residual of station i: ``e = log((A X)^-1 Z B)``, six numbers, metres and radians.
+Residual of station i: ``e = log((A X)^-1 Z B)``, six numbers, metres and radians. X is
+that of the mount which the station has; Z is common to all.
 With ``A_true = A exp(a)`` and ``B_true = B exp(b)``, a and b small and random, it is
 ``Ad(X^-1) a - b`` to first order, so that its covariance is
 ``Ad(X^-1) Cov(a) Ad(X^-1)' + Cov(b)``: rotation and translation, robot and camera
@@ -12,6 +13,7 @@ doi:10.1109/IROS.2006.282250, choose the weights; here they are given).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,18 +43,19 @@ class Refinement:
     """X and Z of ``a_i X = Z b_i`` with what is known about their errors.
 
     Attributes:
-        x: The motion on the moving side.
+        xs: The motion on the moving side with each of k mounts.
         z: The motion on the standing side.
-        covariance: Of the right tangents of X and Z, shape (12, 12), m and rad.
+        covariance: Of the right tangents of each X, then of Z, 6 (k + 1) = q numbers,
+            shape (q, q), m and rad.
         residuals: ``log((A X)^-1 Z B)``, shape (n, 6), m and rad.
         chi2: Sum of squared whitened residuals.
-        by_b: Derivative of the two tangents by the tangents of b_i, (12, n, 6).
-        gradient: Derivative of the residuals by the two tangents, (n, 6, 12).
+        by_b: Derivative of these tangents by the tangents of b_i, (q, n, 6).
+        gradient: Derivative of the residuals by these tangents, (n, 6, q).
         residuals_by_b: Derivative of the residuals by the tangents of b_i, (n, 6, 6).
         precision: Inverse covariances of the residuals, shape (n, 6, 6).
     """
 
-    x: SE3
+    xs: tuple[SE3, ...]
     z: SE3
     covariance: Floats
     residuals: Floats
@@ -61,6 +64,12 @@ class Refinement:
     gradient: Floats
     residuals_by_b: Floats
     precision: Floats
+
+    @property
+    def x(self) -> SE3:
+        """The motion on the moving side, where there is one mount."""
+        (x,) = self.xs
+        return x
 
 
 def residuals_axzb(
@@ -74,7 +83,7 @@ def residuals_axzb(
     Args:
         a: Shape (n, 4, 4), metres.
         b: Shape (n, 4, 4), metres.
-        x: Shape (4, 4).
+        x: Shape (4, 4), or (n, 4, 4) for one of each station.
         z: Shape (4, 4).
 
     Returns:
@@ -91,34 +100,39 @@ def residuals_axzb(
 def refine_axzb(
     a: Floats,
     b: Floats,
-    x: SE3,
+    xs: Sequence[SE3],
     z: SE3,
     covariance_a: Floats,
     covariance_b: Floats,
+    mounts: NDArray[np.intp] | None = None,
 ) -> Refinement:
     """Gauss-Newton from a closed form; cost linear in the number of stations.
 
     Args:
         a: Poses, shape (n, 4, 4), metres.
         b: Poses, shape (n, 4, 4), metres.
-        x: Start for X.
+        xs: Start for the X of each mount.
         z: Start for Z.
         covariance_a: Of a_i's right tangents, (6, 6) or (n, 6, 6).
         covariance_b: Of b_i's right tangents, (6, 6) or (n, 6, 6).
+        mounts: Which X each station has, shape (n,); None for the only one.
 
     Raises:
         InputError: the covariances leave a direction without noise.
         ConvergenceError: 50 iterations did not suffice.
     """
-    x_matrix, z_matrix = np.array(x.matrix), np.array(z.matrix)
+    x_matrices, z_matrix = np.array([x.matrix for x in xs]), np.array(z.matrix)
+    of_station = 0 if mounts is None else mounts
     rounding = _ROUNDING * max(
         1.0, np.abs(a[:, :3, 3]).max(), np.abs(b[:, :3, 3]).max()
     )
     for _ in range(_MAX_ITERATIONS):
+        x_matrix = x_matrices[of_station]
         adjoint = se3_adjoint(se3_inverse(x_matrix))
-        noise = adjoint @ covariance_a @ adjoint.T + covariance_b
+        noise = adjoint @ covariance_a @ np.swapaxes(adjoint, -1, -2) + covariance_b
         precision = _inverse(np.broadcast_to(noise, (len(a), 6, 6)))
         e, gradient, by_b = residuals_axzb(a, b, x_matrix, z_matrix)
+        gradient = _by_mounts(gradient, len(xs), of_station)
         weighted = np.swapaxes(gradient, 1, 2) @ precision
         normal = np.einsum("nij,njk->ik", weighted, gradient)
         scale = 1.0 / np.sqrt(np.diagonal(normal))
@@ -126,8 +140,8 @@ def refine_axzb(
             scale[:, None] * scale * np.linalg.inv(normal * scale[:, None] * scale)
         )
         step = -covariance @ np.einsum("nij,nj->i", weighted, e)
-        x_matrix = x_matrix @ se3_exp(step[:6])
-        z_matrix = z_matrix @ se3_exp(step[6:])
+        x_matrices = x_matrices @ se3_exp(step[:-6].reshape(-1, 6))
+        z_matrix = z_matrix @ se3_exp(step[-6:])
         small = np.maximum(_STEP_TOLERANCE * np.sqrt(np.diagonal(covariance)), rounding)
         if (np.abs(step) < small).all():
             break
@@ -137,9 +151,10 @@ def refine_axzb(
             f"(last step {np.abs(step).max():.2g}); check that a[i] and b[i] belong "
             "together and that the covariances are in metres and radians"
         )
-    e, gradient, by_b = residuals_axzb(a, b, x_matrix, z_matrix)
+    e, gradient, by_b = residuals_axzb(a, b, x_matrices[of_station], z_matrix)
+    gradient = _by_mounts(gradient, len(xs), of_station)
     return Refinement(
-        SE3(x_matrix),
+        tuple(SE3(x_matrix) for x_matrix in x_matrices),
         SE3(z_matrix),
         covariance,
         e,
@@ -149,6 +164,15 @@ def refine_axzb(
         by_b,
         precision,
     )
+
+
+def _by_mounts(gradient: Floats, k: int, mounts: int | NDArray[np.intp]) -> Floats:
+    """Derivatives by the station's X and Z, (n, 6, 12), as by each X and Z."""
+    n = len(gradient)
+    spread = np.zeros((n, 6, k + 1, 6))
+    spread[np.arange(n), :, mounts] = gradient[..., :6]
+    spread[:, :, k] = gradient[..., 6:]
+    return spread.reshape(n, 6, -1)
 
 
 def _inverse(covariance: Floats) -> Floats:

@@ -238,7 +238,7 @@ def _fit(
     a: Floats, b: Floats, x: SE3, z: SE3, logs: Floats, covariance: Floats
 ) -> Refinement:
     of_robot = np.diag(np.repeat(np.exp(logs[:2]), 3))
-    return refine_axzb(a, b, x, z, of_robot, np.exp(logs[2]) * covariance)
+    return refine_axzb(a, b, (x,), z, of_robot, np.exp(logs[2]) * covariance)
 
 
 def _noise_step(found: Refinement, logs: Floats, covariance: Floats) -> Floats:

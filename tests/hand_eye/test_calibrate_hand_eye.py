@@ -15,9 +15,14 @@ from handeye_tri.records import (
     Covariance,
     Repeatability,
     motion_labels,
+    triangle_name,
 )
 from handeye_tri.se3 import SE3
-from handeye_tri.synthesize import reference_geometry, synthesize
+from handeye_tri.synthesize import (
+    reference_geometry,
+    synthesize,
+    two_mount_geometry,
+)
 
 NAMES = ("fx", "fy", "skew", "cx", "cy")
 LABELS = (
@@ -79,6 +84,116 @@ def test_exact_data_give_the_exact_cell(geometry):
     assert found.chi2 < 1e-15
     assert found.dof == 6 * 22 - 12
     assert np.abs(found.residuals).max() < 1e-12
+
+
+@pytest.fixture(scope="module")
+def both():
+    return two_mount_geometry(np.random.default_rng(0), half_turns=5)
+
+
+def test_exact_data_give_both_mounts(both):
+    session, truth = synthesize(both, np.random.default_rng(1), sigma_px=0.0)
+    found = calibrate_hand_eye(session, drawn_cameras(both))
+    rows = compare_with_truth(found, truth)
+    assert {"flange_from_triangle.x", "flange_from_triangle_2.x"} <= {
+        row.quantity for row in rows
+    }
+    for row in rows:
+        assert abs(row.error) < 1e-12, row
+    (second,) = found.other_mounts
+    np.testing.assert_allclose(
+        second.markers, truth.other_mounts[0].markers, atol=1e-12
+    )
+    assert set(found.alternatives) == set(RELATIVE_METHODS)
+    for motion in found.alternatives.values():
+        np.testing.assert_allclose(
+            motion.matrix, truth.base_from_camera[0].matrix, atol=1e-11
+        )
+    assert found.dof == 6 * 20 - 18
+    assert found.chi2 < 1e-15
+    assert np.abs(found.residuals).max() < 1e-12
+
+
+def about(geometry, axis, *, turn=0.5, count=6):
+    """The geometry with its first poses turned about one axis of the base."""
+    first = geometry.stations[0].base_from_flange
+    pivot = SE3.from_parts(np.eye(3), (0.45, 0.0, 0.42))
+    motions = [
+        pivot @ SE3.exp((0, 0, 0, *(angle * np.asarray(axis)))) @ pivot.inverse()
+        for angle in np.linspace(-turn, turn, count)
+    ]
+    stations = tuple(
+        dataclasses.replace(
+            geometry.stations[0], index=j, base_from_flange=motion @ first
+        )
+        for j, motion in enumerate(motions)
+    )
+    return dataclasses.replace(geometry, stations=stations, half_turns=())
+
+
+def test_one_axis_with_each_mount_is_enough_if_they_differ():
+    rng = np.random.default_rng(0)
+    one, two = (reference_geometry(rng, half_turns=1) for _ in range(2))
+    turned = about(one, (0, 0, 1)), about(two, (0, 1, 0))
+    other = SE3.exp((-0.03, 0.01, 0.05, 0.1, 0.2, -0.1)) @ two.flange_from_triangle
+    two = dataclasses.replace(turned[1], flange_from_triangle=other)
+    session, truth = synthesize(turned[0].followed_by(two), rng, sigma_px=0.0)
+    found = calibrate_hand_eye(session, drawn_cameras(one))
+    for row in compare_with_truth(found, truth):
+        assert abs(row.error) < 1e-11, row
+    # Each by itself, and both about the same axis, leave the cameras open.
+    parallel = dataclasses.replace(about(one, (0, 0, 1)), flange_from_triangle=other)
+    for geometry in (turned[0], turned[1], turned[0].followed_by(parallel)):
+        session, _ = synthesize(geometry, rng, sigma_px=0.0)
+        with pytest.raises(DegenerateMotionError, match="parallel"):
+            calibrate_hand_eye(session, drawn_cameras(one))
+
+
+@pytest.mark.parametrize(
+    ("kept", "words"),
+    [
+        ([], "mount 2 .* 0 calibration stations .* add"),
+        ([13], "mount 2 .* 1 calibration station with .* leave its stations out"),
+    ],
+)
+def test_a_mount_without_enough_stations_is_named(both, kept, words):
+    session, _ = synthesize(both, np.random.default_rng(1), sigma_px=0.1)
+    pixels = np.array(session.pixels)
+    lost = np.setdiff1d(np.flatnonzero(session.mounts == 1), kept)
+    pixels[0, lost, 1] = np.nan
+    with pytest.raises(InputError, match=words):
+        calibrate_hand_eye(
+            dataclasses.replace(session, pixels=pixels), drawn_cameras(both)
+        )
+
+
+def test_covariance_of_both_mounts_is_the_spread(both):
+    keep = [
+        *LABELS[:10],
+        *motion_labels("base_from_left"),
+        *motion_labels("base_from_right"),
+        *motion_labels(triangle_name(0)),
+        *motion_labels(triangle_name(1)),
+    ]
+    nees, chi2 = [], []
+    for seed in range(30):
+        session, truth = synthesize(
+            both,
+            np.random.default_rng([1, seed]),
+            sigma_px=0.05,
+            repeatability=REPEATABILITY,
+        )
+        found = calibrate_hand_eye(
+            session, drawn_cameras(both, np.random.default_rng([2, seed]))
+        )
+        rows = {row.quantity: row.error for row in compare_with_truth(found, truth)}
+        error = np.array([rows[label] for label in keep])
+        nees.append(error @ np.linalg.solve(found.covariance.block(keep), error) / 34)
+        chi2.append(found.chi2 / found.dof)
+    # Means of 30 normalised chi-squares of 34 and 102 degrees of freedom: standard
+    # deviations of 0.044 and 0.026.
+    assert abs(np.mean(nees) - 1) < 0.18
+    assert abs(np.mean(chi2) - 1) < 0.1
 
 
 def test_joint_covariance_is_the_spread(geometry):
