@@ -55,8 +55,9 @@ def assess(
     """
     found, expected = _half_turn_misfit(session)
     rotations = session.base_from_flange[session.indices("calibration"), :3, :3]
-    turn = calibration.flange_from_triangle.rotation
-    planes = session.base_from_flange[[t.before for t in session.half_turns], :3, :3]
+    before = [turn.before for turn in session.half_turns]
+    planes = session.base_from_flange[before, :3, :3]
+    turn = _rigs(calibration)[session.mounts[before], :3, :3]
     gates = (
         half_turn_gate(found, expected),
         motion_gate(
@@ -157,9 +158,10 @@ def free_scale(
 
     With the rotations of the hand-eye solution held, the translations of
     ``base_from_flange @ flange_from_triangle = base_from_camera @
-    camera_from_triangle`` are linear in both unknown translations and in a factor
-    on the cameras' lengths. The standard deviation holds what the residuals show and
-    what the cameras' own covariance adds: it moves all stations together.
+    camera_from_triangle`` are linear in the unknown translations (of the cameras, and
+    of each mount) and in a factor on the cameras' lengths. The standard deviation holds
+    what the residuals show and what the cameras' own covariance adds: it moves all
+    stations together.
     """
     stations = session.indices("calibration")
     observed = triangle_poses(
@@ -170,21 +172,31 @@ def free_scale(
         session.marker_radii,
         start=se3_inverse(calibration.base_from_camera[0].matrix)
         @ session.base_from_flange[stations]
-        @ calibration.flange_from_triangle.matrix,
+        @ _rigs(calibration)[session.mounts[stations]],
     )
-    flange = session.base_from_flange[stations[observed.views]]
+    used = stations[observed.views]
+    flange, mounts = session.base_from_flange[used], session.mounts[used]
+    at = 3 * len(calibration.mounts)
     poses = observed.reference_from_triangle
     base_from_reference = calibration.base_from_camera[0].rotation
-    rows = np.zeros((len(poses), 3, 7))
-    rows[:, :, :3] = -flange[:, :3, :3]
-    rows[:, :, 3:6] = np.eye(3)
-    rows[:, :, 6] = poses[:, :3, 3] @ base_from_reference.T
-    matrix, target = rows.reshape(-1, 7), flange[:, :3, 3].ravel()
+    rows = np.zeros((len(poses), 3, at + 4))
+    for mount in range(len(calibration.mounts)):
+        held = mounts == mount
+        rows[held, :, 3 * mount : 3 * mount + 3] = -flange[held, :3, :3]
+    rows[:, :, at : at + 3] = np.eye(3)
+    rows[:, :, -1] = poses[:, :3, 3] @ base_from_reference.T
+    matrix, target = rows.reshape(-1, at + 4), flange[:, :3, 3].ravel()
     inverse = np.linalg.pinv(matrix)
     solution = inverse @ target
     residual = target - matrix @ solution
-    by_residuals = residual @ residual / (len(target) - 7) * inverse[6] @ inverse[6]
+    dof = len(target) - len(solution)
+    by_residuals = residual @ residual / dof * inverse[-1] @ inverse[-1]
     moved = base_from_reference @ poses[:, :3, :3] @ observed.by_cameras[:, :3]
-    gradient = -solution[6] * inverse[6] @ moved.reshape(len(target), -1)
+    gradient = -solution[-1] * inverse[-1] @ moved.reshape(len(target), -1)
     by_cameras = gradient @ cameras.covariance.matrix @ gradient
-    return float(solution[6]), float(np.sqrt(by_residuals + by_cameras))
+    return float(solution[-1]), float(np.sqrt(by_residuals + by_cameras))
+
+
+def _rigs(calibration: HandEyeCalibration) -> Floats:
+    """How each mount holds the triangle on the flange, shape (k, 4, 4), metres."""
+    return np.array([mount.flange_from_triangle.matrix for mount in calibration.mounts])

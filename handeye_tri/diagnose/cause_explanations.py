@@ -115,6 +115,24 @@ CAUSES: dict[str, Explanation] = {
             "look at the crops of those views in report.html",
         ),
     ),
+    "MOUNT": Explanation(
+        "The triangle was on another mount than is recorded for some stations.",
+        (
+            "the tool was changed earlier or later than the programme says",
+            "the mounts were put on in the other order",
+            "the stations' mounts, or the station of the tool change, were typed in "
+            "wrongly",
+        ),
+        "How far the markers are from where everything else has them, as recorded and "
+        "on the other mount, px; or what the half-turns turn about, as the markers "
+        "show that stand still.",
+        "Those stations; where half-turns are among them, what was calibrated from "
+        "them.",
+        (
+            "see in the images which holder was on the flange",
+            "state the tool change where it was made, and calibrate again",
+        ),
+    ),
     "STALE": Explanation(
         "An image shows the markers where they were at another station.",
         (

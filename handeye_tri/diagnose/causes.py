@@ -46,13 +46,22 @@ def possible_causes(session: Session, joints: RobotParameters | None) -> list[Ca
 
 
 def _steps(session: Session) -> list[Cause]:
-    """The rig on the flange, or one camera, is elsewhere from some station on."""
+    """The rig on its mount, or one camera, is elsewhere from some station on."""
     m, n = session.pixels.shape[:2]
+    mounts = session.mounts
+    count = len(set(mounts.tolist()))
     causes = []
     for station in range(1, n):
         step = np.zeros((n, 6, 6))
         step[station:] = np.eye(6)
-        causes.append(Cause("rig", step, station=station, siblings=n - 1))
+        mount = int(mounts[station])
+        if mount in mounts[:station]:
+            # With another mount the rig is elsewhere anyway.
+            held = step * (mounts == mount)[:, None, None]
+            label = session.mount_name(mount) if count > 1 else ""
+            causes.append(
+                Cause("rig", held, station=station, siblings=n - count, label=label)
+            )
         for i in range(m):
             if np.isfinite(session.pixels[i, :station]).any():
                 causes.append(
@@ -102,7 +111,7 @@ def _clocks(session: Session, joints: RobotParameters | None) -> list[Cause]:
 
     A robot that leaves a station accelerates first: after the same time it is equally
     far on its way in the joint that leads, or, where joints are not known, it has done
-    the same part of the way.
+    the same part of the way. The way to a tool change is not known; it counts as none.
     """
     poses, n = session.base_from_flange, len(session.stations)
     ahead, behind = np.zeros((n, 6)), np.zeros((n, 6))
@@ -115,6 +124,8 @@ def _clocks(session: Session, joints: RobotParameters | None) -> list[Cause]:
         way /= np.maximum(np.abs(way).max(axis=1, keepdims=True), 1e-9)
         ahead[:-1] = (joints.jacobian[:-1] @ way[..., None])[..., 0]
         behind[1:] = (joints.jacobian[1:] @ -way[..., None])[..., 0]
+    changes = np.flatnonzero(np.diff(session.mounts))
+    ahead[changes], behind[changes + 1] = 0.0, 0.0
     return [
         Cause("clock", tangent[..., None], siblings=2, label=label)
         for tangent, label in ((ahead, "late"), (behind, "early"))

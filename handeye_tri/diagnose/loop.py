@@ -66,13 +66,13 @@ class Fit:
         cameras: The cameras.
         places: base_from_camera at every station, (m, n, 4, 4), metres.
         poses: base_from_flange at every station, (n, 4, 4), metres.
-        markers: In the flange frame, (3, 3), metres.
+        markers: In the flange frame, by mount, (k, 3, 3), metres.
         chi2: Sum of squared whitened residuals.
         dof: Numbers less unknowns.
         by_station: chi2 of each station, (n,).
         values: phi of the last cause, (p,); none without a cause.
         covariance: Of phi, (p, p).
-        markers_covariance: Of the markers, (9, 9), m^2.
+        markers_covariance: Of the markers, (9 k, 9 k), m^2.
         rank: How many of phi's directions the data determine.
     """
 
@@ -133,6 +133,7 @@ class Loop:
             for info in session.cameras
         ]
         self.root = _root(session)
+        self.mounts = session.mounts
 
     def start(self, calibration: HandEyeCalibration) -> Fit:
         """The cell as it was calibrated."""
@@ -142,12 +143,13 @@ class Loop:
             calibration.cameras,
             np.repeat(places[:, None], n, axis=1),
             self.session.base_from_flange,
-            calibration.markers,
+            np.array([mount.markers for mount in calibration.mounts]),
         )
 
     def local(self, fit: Fit) -> Floats:
         """Markers in each camera's frame, (m, n, 3, 3), metres."""
-        base = fit.markers @ fit.poses[:, :3, :3].mT + fit.poses[:, None, :3, 3]
+        markers = fit.markers[self.mounts]
+        base = markers @ fit.poses[:, :3, :3].mT + fit.poses[:, None, :3, 3]
         inverse = se3_inverse(fit.places)
         return np.asarray(base @ inverse[..., :3, :3].mT + inverse[..., None, :3, 3])
 
@@ -164,6 +166,16 @@ class Loop:
                 camera.project(local[i])
                 + sphere_shift(camera, local[i], self.session.marker_radii)
                 for i, camera in enumerate(fit.cameras)
+            ]
+        )
+
+    def predicted_with_mounts(self, fit: Fit) -> Floats:
+        """The same were each mount the only one, (k, m, n, 3, 2), px."""
+        k = len(fit.markers)
+        return np.array(
+            [
+                self.predicted(replace(fit, markers=np.repeat(one[None], k, axis=0)))
+                for one in fit.markers
             ]
         )
 
@@ -190,6 +202,7 @@ class Loop:
             solved = self._solve(equations, cause, by_station, robust=robust)
             step, covariance, rank = solved
             g = equations.shared.shape[2]
+            nine = slice(g - fit.markers.size, g)
             found = replace(
                 fit,
                 chi2=chi2,
@@ -197,7 +210,7 @@ class Loop:
                 by_station=by_station,
                 values=values,
                 covariance=covariance[g:, g:],
-                markers_covariance=covariance[g - 9 : g, g - 9 : g],
+                markers_covariance=covariance[nine, nine],
                 rank=rank if p else 0,
             )
             settled = best is not None and best.chi2 - chi2 < _SETTLED
@@ -293,7 +306,7 @@ class Loop:
             cameras=tuple(cameras),
             places=places,
             poses=poses,
-            markers=fit.markers + step[at : at + 9].reshape(3, 3),
+            markers=fit.markers + step[at:].reshape(fit.markers.shape),
             values=values,
         )
 
@@ -311,7 +324,8 @@ class Loop:
             return None
         safe = np.where(self.seen[..., None], local, [0.0, 0.0, 1.0])
         widths = [sum(map(len, self._columns(i))) + 6 for i in range(m)]
-        g = sum(widths) + 9
+        first_marker = sum(widths)
+        g = first_marker + fit.markers.size
         residual = np.zeros((n, m, 3, 2))
         shared = np.zeros((n, m, 3, 2, g))
         flange = np.zeros((n, m, 3, 2, 6))
@@ -329,7 +343,7 @@ class Loop:
             by_base = by_point @ rotation[:, None]
             by_place = np.concatenate([-by_point, by_point @ hat(safe[i])], axis=-1)
             by_marker = by_base @ fit.poses[:, None, :3, :3]
-            turning = -by_marker @ hat(fit.markers)
+            turning = -by_marker @ hat(fit.markers[self.mounts])
             flange[:, i] = np.concatenate([by_marker, turning], axis=-1)
             places[i, :, i] = by_place
             stop = at + len(inner)
@@ -339,9 +353,11 @@ class Loop:
             )
             at += widths[i]
             shared[:, i, ..., at - 6 : at] = by_place
-            for k in range(3):
-                start = g - 9 + 3 * k
-                shared[:, i, k, :, start : start + 3] = by_marker[:, k]
+            for mount in range(len(fit.markers)):
+                held = self.mounts == mount
+                for k in range(3):
+                    start = first_marker + 9 * mount + 3 * k
+                    shared[held, i, k, :, start : start + 3] = by_marker[held, k]
         size = 6 * m
         by_flange = flange.reshape(n, size, 6)
         whitener = self._whitener(by_flange)

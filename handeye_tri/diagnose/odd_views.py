@@ -1,4 +1,4 @@
-"""Views that another reading explains at once: markers exchanged, an old image."""
+"""Views that another reading explains: markers exchanged, an old image, a mount."""
 
 from __future__ import annotations
 
@@ -31,28 +31,31 @@ class OddView:
     Attributes:
         camera: Index of the camera.
         station: Index of the station.
-        kind: "labels" or "stale".
+        kind: "labels", "mount" or "stale".
         residual: Root mean square residual as it stands, px.
         left: The same as the other reading has it, px.
-        reading: The labels in the order they belong, or the station of the image.
+        reading: The labels in the order they belong, the mount (from 1), or the
+            station of the image.
     """
 
     camera: int
     station: int
-    kind: Literal["labels", "stale"]
+    kind: Literal["labels", "mount", "stale"]
     residual: float
     left: float
     reading: str
 
 
-def odd_views(session: Session, predicted: Floats) -> list[OddView]:
+def odd_views(session: Session, with_mounts: Floats) -> list[OddView]:
     """Find them by what the rest of the session predicts.
 
     Args:
         session: What was detected.
-        predicted: Where the markers should be, (m, n, 3, 2), px.
+        with_mounts: Where the markers would be with each mount, (k, m, n, 3, 2), px.
     """
     pixels = session.pixels
+    stations = np.arange(len(session.stations))
+    predicted = np.moveaxis(with_mounts[session.mounts, :, stations], 0, 1)
     seen = np.isfinite(pixels).all(axis=(-2, -1)) & np.isfinite(predicted).all(
         axis=(-2, -1)
     )
@@ -63,7 +66,12 @@ def odd_views(session: Session, predicted: Floats) -> list[OddView]:
         view = (int(i), int(j))
         limit = min(_SHARE * residual[view], _USUAL * usual + _LEAST)
         odd = _exchanged(pixels[view], predicted[view], limit)
-        kind: Literal["labels", "stale"] = "labels"
+        kind: Literal["labels", "mount", "stale"] = "labels"
+        if odd is None:
+            odd, kind = (
+                _otherwise_held(pixels[view], with_mounts[:, i, j], limit),
+                "mount",
+            )
         if odd is None:
             odd, kind = _repeated(session, predicted, *view), "stale"
         if odd is not None:
@@ -80,6 +88,16 @@ def _exchanged(
         if left < limit and (best is None or left < best[0]):
             best = left, ", ".join(VERTICES[k] for k in order)
     return best
+
+
+def _otherwise_held(
+    pixels: Floats, predicted: Floats, limit: float
+) -> tuple[float, str] | None:
+    """Whether the view is one with another mount, of predicted (k, 3, 2)."""
+    left = np.sqrt(np.mean((pixels - predicted) ** 2, axis=(-2, -1)))
+    # NaN, behind the camera, is no explanation.
+    mount = int(np.argmin(np.where(np.isfinite(left), left, np.inf)))
+    return (float(left[mount]), str(mount + 1)) if left[mount] < limit else None
 
 
 def _repeated(

@@ -13,6 +13,7 @@ from handeye_tri.diagnose.causes import best_cause, possible_causes, turned_angl
 from handeye_tri.diagnose.gates import PREDICTION_GATE, Finding, Verdict
 from handeye_tri.diagnose.images import blurred_views, image_findings, views_due
 from handeye_tri.diagnose.loop import Cause, Fit, Loop
+from handeye_tri.diagnose.mounts import mount_findings
 from handeye_tri.diagnose.odd_views import OddView, odd_views
 from handeye_tri.diagnose.sides import side_finding
 from handeye_tri.records import DroppedHalfTurn, HandEyeCalibration, Session
@@ -44,6 +45,8 @@ class Evidence:
         joints: The joints' offsets, where there is a model of the robot.
         edges: How wide each marker's edge is, (m, n, 3, 3): mean variance and both
             parts of its elongation, px^2; None where nobody measured it.
+        recorded: The session as recorded, where ``session`` has other mounts, which
+            its half-turns show; None where it is that.
     """
 
     session: Session
@@ -51,16 +54,17 @@ class Evidence:
     dropped: Sequence[DroppedHalfTurn] = ()
     joints: RobotParameters | None = None
     edges: Floats | None = None
+    recorded: Session | None = None
 
 
 def session_causes(evidence: Evidence) -> tuple[Finding, ...]:
     """Name what is wrong with a session, the likeliest first.
 
     Images speak first: views that are blurred, whose markers are exchanged, or that
-    are those of another station, are named and set aside. On the others the causes of
-    :func:`possible_causes` compete, again and again until no further one is more than
-    chance. With what is left the markers' sides, as the robot's motions give them, are
-    held against the stated ones.
+    are those of another mount or station, are named and set aside. On the others the
+    causes of :func:`possible_causes` compete, again and again until no further one is
+    more than chance. With what is left the markers' sides, as the robot's motions give
+    them, are held against the stated ones.
     """
     session = evidence.session
     shape = session.pixels.shape[:2]
@@ -70,7 +74,7 @@ def session_causes(evidence: Evidence) -> tuple[Finding, ...]:
         usable[i, j] = False
     start = _robust_start(evidence, usable)
     usable &= Loop(session).in_front(start)
-    odd = odd_views(session, Loop(session).predicted(start))
+    odd = odd_views(session, Loop(session).predicted_with_mounts(start))
     odd = [view for view in odd if usable[view.camera, view.station]]
     for view in odd:
         usable[view.camera, view.station] = False
@@ -91,6 +95,7 @@ def session_causes(evidence: Evidence) -> tuple[Finding, ...]:
     names = [info.name for info in session.cameras]
     findings = [
         *image_findings(session, blurred, evidence.edges, views_due(loop, fit)),
+        *mount_findings(evidence.recorded or session, session, odd),
         *_odd_findings(odd, names),
         *turn_findings(session, {c.station for c, _, _ in found if c.kind == "pose"}),
         *_cause_findings(found, names, "BLUR" if blurred else ""),
@@ -272,12 +277,13 @@ def _moved_finding(group: list[Explained], names: list[str]) -> Finding:
             f"{_size(fit.values)} (+- {sigma:.2f} mm) between stations "
             f"{cause.station - 1} and {cause.station}"
         )
+    held = " and ".join(dict.fromkeys(c.label for c, _, _ in group if c.label))
     first = group[0][0]
     stations = tuple(sorted({cause.station for cause, _, _ in group}))
     if first.kind == "rig":
         return Finding(
             "RIG_SLIPPED",
-            "the rig moved on the flange in the middle of the session",
+            f"the rig moved on {held or 'the flange'} in the middle of the session",
             f"by {'; '.join(steps)}; {_fall(group)}",
             "error",
             "tighten the rig and record the session again; all before or all after it "

@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from handeye_tri.diagnose.causes import CHANCE
 from handeye_tri.diagnose.gates import Finding
@@ -28,6 +29,14 @@ _UNITS = (
     (0.3048, "metres for feet"),
 )
 _UNIT_TOLERANCE = 0.05
+# A measure is told that differs by so many sigmas between two mounts.
+_DIFFERENT_SIGMAS = 3.0
+# What is measured of a triangle, its unit, and that unit in metres or radians.
+_NAMES = (
+    ("side AB", "mm", 1e3),
+    ("side AC", "mm", 1e3),
+    ("the angle at A", "deg", float(np.degrees(1.0))),
+)
 
 
 def side_finding(session: Session, fit: Fit) -> Finding | None:
@@ -35,18 +44,24 @@ def side_finding(session: Session, fit: Fit) -> Finding | None:
 
     The robot's motions fix the metre and need no measured side. Explained are the
     three lengths by the fewest wrong of AB, AC and the angle between them, or by one
-    factor on all lengths.
+    factor on all lengths. All mounts hold the same triangle; where they do not, that is
+    the answer.
 
     Args:
         session: What was stated.
         fit: The cell with everything else that is wrong taken out.
     """
-    found, slope = _measures(fit.markers)
+    each, slopes = zip(*(_measures(markers) for markers in fit.markers), strict=True)
     stated = np.array(
         [session.triangle.side_ab, session.triangle.side_ac, session.triangle.angle]
     )
     noise = max(1.0, fit.chi2 / max(fit.dof, 1))
-    covariance = noise * slope @ fit.markers_covariance @ slope.T
+    slope = block_diag(*slopes)
+    found, covariance, apart = _in_common(
+        np.concatenate(each), noise * slope @ fit.markers_covariance @ slope.T
+    )
+    if apart is not None:
+        return _different_finding(session, np.array(each), apart)
     missed = found - stated
     square = float(missed @ np.linalg.solve(covariance, missed))
     # scipy.stats has the same tail but takes a second to import.
@@ -67,15 +82,10 @@ def side_finding(session: Session, fit: Fit) -> Finding | None:
             "poses; nothing is converted on a guess",
         )
     wrong = _fewest(missed, covariance)
-    names = (
-        ("side AB", "mm", 1e3),
-        ("side AC", "mm", 1e3),
-        ("the angle at A", "deg", float(np.degrees(1.0))),
-    )
     told = [
         f"{name} is {unit * found[k]:.3f} +- {unit * np.sqrt(covariance[k, k]):.3f} "
         f"{word} by the robot's motions, {unit * stated[k]:.3f} stated"
-        for k, (name, word, unit) in enumerate(names)
+        for k, (name, word, unit) in enumerate(_NAMES)
         if k in wrong
     ]
     common = len(wrong) > 1 and _fits(
@@ -85,7 +95,7 @@ def side_finding(session: Session, fit: Fit) -> Finding | None:
         f"all sides are {factor:.5f} times as long as stated, or the robot's lengths "
         "are off by that factor"
         if common
-        else f"{' and '.join(names[k][0] for k in wrong)} of the triangle "
+        else f"{' and '.join(_NAMES[k][0] for k in wrong)} of the triangle "
         f"{'was' if len(wrong) == 1 else 'were'} measured wrongly"
     )
     return Finding(
@@ -95,6 +105,65 @@ def side_finding(session: Session, fit: Fit) -> Finding | None:
         "warning",
         "measure again between the marker centres; calibrated jointly, the result "
         "takes its metre from the robot, not from these sides",
+    )
+
+
+def _in_common(
+    each: Floats, covariance: Floats
+) -> tuple[Floats, Floats, Floats | None]:
+    """What mounts say together of the one triangle that they hold.
+
+    Given that all are alike: the first's, corrected by what the others differ from it.
+
+    Args:
+        each: Measures by mount, one after the other, shape (3 k,).
+        covariance: Of all of them, (3 k, 3 k).
+
+    Returns:
+        Measures (3,), their covariance (3, 3); None, or, where the mounts differ by
+        more than chance and tolerance, the sigmas of what they differ by, (k - 1, 3).
+    """
+    others = len(each) // 3 - 1
+    difference = np.hstack([np.tile(-np.eye(3), (others, 1)), np.eye(3 * others)])
+    between = difference @ covariance @ difference.T
+    missed = difference @ each
+    gain = np.linalg.solve(between, difference @ covariance[:, :3]).T
+    apart = None
+    relative = np.abs(missed) / np.tile([each[0], each[1], 1.0], others)
+    # scipy.stats has the same tail but takes a second to import.
+    from scipy.special import chdtrc
+
+    square = float(missed @ np.linalg.solve(between, missed))
+    beyond = relative.max(initial=0.0) >= _TOLERANCE
+    if beyond and chdtrc(3 * others, square) <= CHANCE:
+        apart = np.sqrt(np.diagonal(between)).reshape(others, 3)
+    found = each[:3] - gain @ missed
+    return found, covariance[:3, :3] - gain @ difference @ covariance[:, :3], apart
+
+
+def _different_finding(session: Session, each: Floats, apart: Floats) -> Finding:
+    """The triangle is another one on another mount.
+
+    Args:
+        session: Names the mounts.
+        each: Measures by mount, (k, 3).
+        apart: Sigmas of those after the first less the first, (k - 1, 3).
+    """
+    told = [
+        f"{name} is {unit * each[0, k]:.3f} {word} on {session.mount_name(0)}, "
+        f"{unit * each[mount, k]:.3f} (+- {unit * apart[mount - 1, k]:.3f}) on "
+        f"{session.mount_name(mount)}"
+        for mount in range(1, len(each))
+        for k, (name, word, unit) in enumerate(_NAMES)
+        if abs(each[mount, k] - each[0, k]) > _DIFFERENT_SIGMAS * apart[mount - 1, k]
+    ]
+    return Finding(
+        "SIDES",
+        "the mounts do not hold the same triangle",
+        f"{'; '.join(told)}, by the robot's motions",
+        "warning",
+        "look whether a marker moved at the tool change; put the same triangle on both "
+        "mounts and record again",
     )
 
 

@@ -17,6 +17,12 @@ from handeye_tri.calibrate_cameras import (
 from handeye_tri.diagnose.best_half_turns import without_bad_half_turns
 from handeye_tri.diagnose.gates import Finding, Verdict
 from handeye_tri.diagnose.images import blurred_views, image_findings
+from handeye_tri.diagnose.mounts import (
+    mount_findings,
+    seen_turns,
+    shown_mounts,
+    with_mounts,
+)
 from handeye_tri.diagnose.pose_pairs import assess_pose_pairs
 from handeye_tri.diagnose.session_causes import Evidence, session_causes, turn_findings
 from handeye_tri.diagnose.sides import unit_words
@@ -69,7 +75,8 @@ def why_uncalibrated(
 ) -> tuple[Finding, ...]:
     """Name what is wrong with a session on which calibration gave up.
 
-    Where the cameras calibrate, robot and cameras contradict each other, and the
+    Half-turns that turn about the axis of another mount than is recorded are seen at
+    once. Where the cameras calibrate, robot and cameras contradict each other, and the
     readings of bare pose pairs are solved: inverted, shifted, in another unit. Where
     they do not, images that belong to the next or the last station, or markers that
     bear each other's names everywhere, would make half-turns that are none. Last, the
@@ -90,6 +97,9 @@ def why_uncalibrated(
     findings = image_findings(session, blurred_views(session, edges), edges)
     if findings:
         return tuple(findings)
+    seen = seen_turns(session)
+    if seen.half_turns != session.half_turns and _cameras(seen) is not None:
+        return _on_other_mounts(session, seen, joints, edges)
     cameras = _cameras(session)
     if cameras is not None:
         return _readings(session.without(cameras.details["dropped"]), cameras)
@@ -171,6 +181,23 @@ def _on_general_motions(
         return ()
 
 
+def _on_other_mounts(
+    session: Session,
+    seen: Session,
+    joints: RobotParameters | None,
+    edges: Floats | None,
+) -> tuple[Finding, ...]:
+    """What is wrong, where half-turns turn about the axis of another mount."""
+    try:
+        shown = with_mounts(seen, shown_mounts(session, seen))
+        cameras = calibrate_session_cameras(shown)
+        lost = cameras.details["dropped"]
+        calibration = calibrate_hand_eye(shown.without(lost), cameras)
+    except HandEyeError:
+        return tuple(mount_findings(session, seen, ()))
+    return session_causes(Evidence(shown, calibration, lost, joints, edges, session))
+
+
 def _cameras(session: Session) -> CameraCalibration | None:
     """The calibrated cameras, None where they are not believable."""
     try:
@@ -221,8 +248,13 @@ def _too_little_turning(session: Session, least: float) -> Finding | None:
 
 
 def _readings(session: Session, cameras: CameraCalibration) -> tuple[Finding, ...]:
-    """What the poses of robot and triangle say as bare pairs."""
+    """What the poses of robot and triangle say as bare pairs.
+
+    Of stations with one mount: a pair knows but one place on the flange.
+    """
     stations = session.indices("calibration")
+    mounts = session.mounts[stations]
+    stations = stations[mounts == np.bincount(mounts).argmax()]
     try:
         observed = triangle_poses(
             session.triangle,
