@@ -131,7 +131,7 @@ def stations_in_blocks(
         )
     if paired or correlation > 0:
         turns = [turn for turn in session.half_turns if turn.axis != "normal"]
-        index, _, members = pairs(turns, used, n)
+        index, members = pairs(turns, used, n)
         on_axis = np.zeros((len(index), 3), dtype=bool)
         for block, member in enumerate(members):
             on_axis[block, list(EDGES[turns[member].axis])] = True

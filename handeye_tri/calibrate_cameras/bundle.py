@@ -104,6 +104,7 @@ def bundle_cameras(
     lenses: Sequence[Sequence[str]] | None = None,
     half_turns: Sequence[HalfTurn] = (),
     turn_noise: TurnNoise | None = None,
+    mounts: Indices | None = None,
     huber: float | None = None,
 ) -> CameraCalibration:
     """Adjust all cameras, their places and the triangle's poses together.
@@ -131,6 +132,8 @@ def bundle_cameras(
             in one at most. Only used with ``turn_noise``.
         turn_noise: How far they may be trusted. None leaves stations independent, which
             one camera cannot do with.
+        mounts: Which mount holds the triangle at each station, shape (n,), from 0;
+            each has axes of its own. None for one mount.
         huber: Distance in sigmas beyond which a point counts linearly; None for none.
 
     Returns:
@@ -145,7 +148,8 @@ def bundle_cameras(
           Thompson 1971, doi:10.1093/biomet/58.3.545);
         - with a covariance in turn_noise, "turn_sigmas": (len(half_turns), 6), the
           deviation of each half-turn over its prior's root, NaN where not used; "axes":
-          names of the axes; "triangle_from_axis": (a, 4, 4), they run along its z.
+          names of the axes, and "axis_mounts" the mount of each; "triangle_from_axis":
+          (a, 4, 4), they run along its z.
 
     Raises:
         InputError: an argument cannot be used; names it.
@@ -169,13 +173,19 @@ def bundle_cameras(
     poses = start_poses(reference_from_triangle, observed.shape[1], used)
     if turn_noise is None:
         blocks, members = used[:, None], np.empty(0, dtype=np.intp)
-        kinds: tuple[Axis, ...] = ()
     else:
-        blocks, kinds, members = pairs(half_turns, used, observed.shape[1])
+        blocks, members = pairs(half_turns, used, observed.shape[1])
+    if mounts is None:
+        mounts = np.zeros(observed.shape[1], dtype=np.intp)
+    of_members = [
+        (half_turns[i].axis, int(mounts[half_turns[i].before]))
+        for i in members.tolist()
+    ]
+    kinds: tuple[tuple[Axis, int], ...] = tuple(dict.fromkeys(of_members))
     present = blocks >= 0
     turns = None
     if turn_noise is not None:
-        turns = _turns(half_turns, members, len(blocks), kinds, turn_noise)
+        turns = _turns(of_members, len(blocks), kinds, turn_noise)
     model = BundleModel(
         triangle.points,
         np.where(seen[:, blocks, :, None], observed[:, blocks], 0.0),
@@ -192,7 +202,9 @@ def bundle_cameras(
         origin @ np.array([motion.matrix for motion in reference_from_camera]),
         origin @ poses[blocks[:, 0]],
         np.zeros((len(blocks), 0 if turns is None else 6)),
-        np.array([_nominal_axis(triangle, kind) for kind in kinds]).reshape(-1, 4, 4),
+        np.array([_nominal_axis(triangle, axis) for axis, _ in kinds]).reshape(
+            -1, 4, 4
+        ),
     )
     start.reference_from_camera[0] = np.eye(4)
     end = _minimum(model, start, names)
@@ -202,13 +214,12 @@ def bundle_cameras(
 
 
 def _turns(
-    half_turns: Sequence[HalfTurn],
-    members: Indices,
+    members: Sequence[tuple[Axis, int]],
     blocks: int,
-    kinds: tuple[Axis, ...],
+    kinds: tuple[tuple[Axis, int], ...],
     noise: TurnNoise,
 ) -> Turns:
-    if len(members) == 0:
+    if not members:
         raise InputError(
             "turn_noise needs half_turns of which both stations are seen; there are "
             "none: give them, or leave turn_noise out"
@@ -216,9 +227,9 @@ def _turns(
     paired = np.arange(blocks) < len(members)
     kind = np.zeros(blocks, dtype=np.intp)
     correlation = np.zeros((blocks, 3))
-    for block, index in enumerate(members):
-        axis = half_turns[index].axis
-        kind[block] = kinds.index(axis)
+    for block, member in enumerate(members):
+        kind[block] = kinds.index(member)
+        axis, _ = member
         if axis != "normal":
             correlation[block, list(EDGES[axis])] = noise.on_axis_correlation
     return Turns(paired, kind, noise.root, correlation)

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from handeye_tri.camera import PinholeCamera
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.records import HalfTurn
-from handeye_tri.triangle import Axis
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -147,12 +146,12 @@ def start_poses(poses: ArrayLike, n: int, used: Indices) -> Floats:
 
 def pairs(
     half_turns: Sequence[HalfTurn], used: Indices, n: int
-) -> tuple[Indices, tuple[Axis, ...], Indices]:
+) -> tuple[Indices, Indices]:
     """Blocks of stations: half-turns with both stations first, then single ones.
 
     Returns:
-        Station indices, (b, 2), -1 for no second one; the kinds of axis; which
-        half-turn each of the first blocks is.
+        Station indices, (b, 2), -1 for no second one; which half-turn each of the
+        first blocks is.
 
     Raises:
         InputError: a station does not exist or belongs to two half-turns.
@@ -176,9 +175,7 @@ def pairs(
     blocks = [(half_turns[i].before, half_turns[i].after) for i in members]
     single = usable.difference(*blocks)
     blocks += [(station, -1) for station in sorted(single)]
-    kinds = tuple(dict.fromkeys(half_turns[i].axis for i in members))
     return (
         np.array(blocks, dtype=np.intp).reshape(-1, 2),
-        kinds,
         np.array(members, dtype=np.intp),
     )

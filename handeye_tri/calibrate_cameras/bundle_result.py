@@ -61,7 +61,7 @@ def bundle_result(
     blocks: Indices,
     members: Indices,
     half_turns: int,
-    kinds: tuple[Axis, ...],
+    kinds: tuple[tuple[Axis, int], ...],
     n: int,
 ) -> CameraCalibration:
     """Judge a minimum and put it into a record.
@@ -73,7 +73,7 @@ def bundle_result(
         blocks: Station indices of each block, (b, w), -1 for none.
         members: Which half-turn each of the first blocks is.
         half_turns: How many half-turns there are.
-        kinds: Names of the axes.
+        kinds: Name and mount of each axis.
         n: How many stations there are.
 
     Raises:
@@ -138,7 +138,8 @@ def bundle_result(
     }
     if model.tied:
         details["turn_sigmas"] = _whole(state.turn[: len(members)], members, half_turns)
-        details["axes"] = kinds
+        details["axes"] = tuple(axis for axis, _ in kinds)
+        details["axis_mounts"] = tuple(mount for _, mount in kinds)
         details["triangle_from_axis"] = state.lines
     return CameraCalibration(
         cameras=calibrated,

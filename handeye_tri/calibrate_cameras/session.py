@@ -46,7 +46,9 @@ def calibrate_session_cameras(session: Session) -> CameraCalibration:
     them together by the robot's repeatability (0.03 mm, 0.005 degrees, at 0.015 px)
     would lower the sigma of fx by 5 to 12 %, not enough to let a robot that repeats
     worse than it says, or does not turn by 180 degrees, into the cameras. A single
-    camera cannot do without the tie.
+    camera cannot do without the tie. Where the triangle changes its mount, the cameras
+    have the half-turns of all mounts; where the axes run in the triangle is every
+    mount's own.
 
     Markers on an edge axis are seen twice at the same place, and much of what detection
     gets wrong there, it gets wrong twice (in rendered images the two errors correlate
@@ -260,6 +262,7 @@ def _together(
         lenses=[info.lens for info in session.cameras],
         half_turns=session.half_turns,
         turn_noise=noise,
+        mounts=session.mounts,
     )
 
 

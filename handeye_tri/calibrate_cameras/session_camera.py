@@ -70,6 +70,9 @@ def alone(
     info = session.cameras[i]
     before = [turn.before for turn in session.half_turns]
     after = [turn.after for turn in session.half_turns]
+    normal = [turn.before for turn in session.half_turns if turn.axis == "normal"]
+    # A normal axis has its foot O where the mount has it: one for all is one mount's.
+    one_foot = len(set(session.mounts[normal].tolist())) < 2
     pixels, covariance = session.pixels[i] - shift, session.pixel_covariance[i]
     whole = np.asarray(np.isfinite(pixels).all(axis=(1, 2)))
     count = int((whole[before] & whole[after]).sum())
@@ -90,6 +93,7 @@ def alone(
             skew=info.skew,
             distortion=(info.lens or None) if refine else None,
             covariance=np.stack([covariance[before], covariance[after]], axis=1),
+            o="shared" if one_foot else "free",
             turn_covariance=turn_covariance(session.repeatability) if refine else None,
             refine=refine,
             reject=reject,

@@ -7,7 +7,12 @@ import numpy as np
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
 from handeye_tri.records import Repeatability
 from handeye_tri.se3 import SE3, se3_exp
-from handeye_tri.synthesize import look_at, reference_geometry, synthesize
+from handeye_tri.synthesize import (
+    look_at,
+    reference_geometry,
+    synthesize,
+    two_mount_geometry,
+)
 
 LENS = Lens("radtan", np.array([-0.15, 0.05, 5e-4, -3e-4, 0.0]))
 ROBOT = Repeatability(3e-5, float(np.radians(0.005)))
@@ -55,17 +60,48 @@ def observe(geometry, seed=0, sigma_px=SIGMA_PX, robot=ROBOT, **options):
     )
 
 
-def true_motions(truth):
-    """reference_from_camera of all cameras and reference_from_triangle, (n, 4, 4)."""
+def two_feet(seed=0, count=2, *, half_turns=8, axes=("normal", "normal"), **options):
+    """Two mounts; about normals through feet 15 mm apart in the triangle."""
+    geometry = two_mount_geometry(
+        np.random.default_rng(seed),
+        half_turns=half_turns // 2,
+        evaluation_stations=0,
+        axes=axes,
+        **options,
+    )
+    stations = list(geometry.stations)
+    (flange_from_triangle,) = geometry.other_mounts
+    foot = geometry.triangle.circumcentre + (0.012, -0.009)
+    for turn in geometry.half_turns[half_turns // 2 :]:
+        if turn.axis == "normal":
+            motion = geometry.triangle.half_turn("normal", foot)
+            moved = flange_from_triangle @ motion @ flange_from_triangle.inverse()
+            pose = stations[turn.before].base_from_flange @ moved
+            stations[turn.after] = replace(stations[turn.after], base_from_flange=pose)
+    return replace(
+        geometry,
+        cameras=geometry.cameras[:count],
+        base_from_camera=geometry.base_from_camera[:count],
+        stations=tuple(stations),
+    )
+
+
+def true_motions(truth, mounts=None):
+    """reference_from_camera of all cameras and reference_from_triangle, (n, 4, 4).
+
+    With several mounts of the triangle, ``mounts`` is that of each station.
+    """
     base = truth.base_from_camera[0].inverse()
-    poses = truth.base_from_flange @ truth.flange_from_triangle.matrix
+    rigs = [truth.flange_from_triangle.matrix]
+    rigs += [mount.flange_from_triangle.matrix for mount in truth.other_mounts]
+    poses = truth.base_from_flange @ np.array(rigs)[0 if mounts is None else mounts]
     return [base @ place for place in truth.base_from_camera], base.matrix @ poses
 
 
-def near(truth, seed=0, size=1.0):
+def near(truth, seed=0, size=1.0, mounts=None):
     """Cameras 1 % and motions about 1 mm and 1 mrad beside the truth."""
     rng = np.random.default_rng([seed, 3])
-    places, poses = true_motions(truth)
+    places, poses = true_motions(truth, mounts)
     cameras = []
     for camera in truth.cameras:
         factor = 1 + 0.01 * size * rng.standard_normal(5)

@@ -2,7 +2,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bundle_scene import LENS, ROBOT, errors, near, nees, observe, scene, true_motions
+from bundle_scene import (
+    LENS,
+    ROBOT,
+    errors,
+    near,
+    nees,
+    observe,
+    scene,
+    true_motions,
+    two_feet,
+)
 
 from handeye_tri.calibrate_cameras.bundle import TurnNoise, bundle_cameras
 from handeye_tri.calibrate_cameras.session_camera import turn_covariance
@@ -15,7 +25,7 @@ EXACT_ROBOT = TurnNoise(np.zeros((6, 6)))
 
 
 def adjust(session, truth, *, size=1.0, **options):
-    cameras, places, poses = near(truth, size=size)
+    cameras, places, poses = near(truth, size=size, mounts=session.mounts)
     options.setdefault("half_turns", session.half_turns)
     options.setdefault("lenses", [info.lens for info in session.cameras])
     options.setdefault("skew", [info.skew for info in session.cameras])
@@ -263,6 +273,30 @@ def test_axis_that_runs_beside_where_it_was_built(axis):
         atol=1e-9,
     )
     np.testing.assert_allclose(result.details["turn_sigmas"], 0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("axes", "lines"),
+    [
+        (("normal", "normal"), (("normal", 0), ("normal", 1))),
+        (("BC", "normal"), (("BC", 0), ("normal", 1))),
+    ],
+)
+@pytest.mark.parametrize("count", [1, 2])
+def test_each_mount_has_axes_of_its_own(axes, lines, count):
+    session, truth = observe(two_feet(count=count, axes=axes), sigma_px=0.0, robot=None)
+    result = adjust(session, truth, turn_noise=EXACT_ROBOT, mounts=session.mounts)
+    np.testing.assert_allclose(errors(result, truth), 0, atol=1e-6)
+    found = result.details
+    assert tuple(zip(found["axes"], found["axis_mounts"], strict=True)) == lines
+    foot = session.triangle.circumcentre + (0.012, -0.009)
+    line = found["triangle_from_axis"][1]
+    along = line[:3, 2] / line[2, 2]
+    np.testing.assert_allclose((line[:3, 3] - line[2, 3] * along)[:2], foot, atol=1e-8)
+    if axes[0] == "normal":
+        # One line for both would have to lie between them.
+        spoiled = adjust(session, truth, turn_noise=NOISE)
+        assert spoiled.chi2 > 100
 
 
 def test_unseen_markers_views_and_stations():
