@@ -24,7 +24,8 @@ from handeye_tri.records import (
 )
 from handeye_tri.se3 import SE3
 from handeye_tri.summary import result_rows
-from handeye_tri.synthesize import reference_geometry, synthesize
+from handeye_tri.synthesize import Geometry as Driven
+from handeye_tri.synthesize import reference_geometry, synthesize, two_mount_geometry
 from handeye_tri.triangle import Axis
 
 RNG = np.random.default_rng
@@ -43,9 +44,22 @@ class Finished:
 @cache
 def finished(seed: int = 1, axis: Axis = "normal") -> Finished:
     """A session of 5 half-turns and 3 held-out stations, calibrated."""
-    geometry = reference_geometry(
-        RNG([seed, 0]), half_turns=5, evaluation_stations=3, axis=axis
+    return _calibrated(
+        reference_geometry(
+            RNG([seed, 0]), half_turns=5, evaluation_stations=3, axis=axis
+        ),
+        seed,
     )
+
+
+@cache
+def finished_on_two_mounts(seed: int = 1) -> Finished:
+    """3 half-turns and 2 held-out stations about a normal, then about the edge BC."""
+    geometry = two_mount_geometry(RNG([seed, 0]), half_turns=3, evaluation_stations=2)
+    return _calibrated(geometry, seed)
+
+
+def _calibrated(geometry: Driven, seed: int) -> Finished:
     session, truth = synthesize(
         geometry,
         RNG([seed, 1]),

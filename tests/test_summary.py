@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from finished_session import finished_on_two_mounts
 
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
 from handeye_tri.diagnose import Finding
@@ -52,6 +53,20 @@ def test_rows_have_sigmas_that_hold_their_errors(calibrated):
     assert np.isfinite(ratio).all()
     assert np.sqrt(np.mean(np.square(ratio))) < 2
     assert len(ratio) == 2 * 5 + 3 * 6
+
+
+def test_each_mount_has_its_rows():
+    done = finished_on_two_mounts()
+    rows = {row["name"]: row for row in result_rows(done.calibration, done.truth)}
+    assert len(rows) == 2 * 5 + 4 * 6
+    for name, mount in (
+        ("flange_from_triangle.x", done.truth),
+        ("flange_from_triangle_2.x", done.truth.other_mounts[0]),
+    ):
+        true = 1e3 * mount.flange_from_triangle.translation[0]
+        row = rows[name]
+        assert row["value"] - row["error"] == pytest.approx(true, abs=1e-9)
+        assert abs(row["error"]) < 5 * row["sigma"]
 
 
 def test_rows_without_truth_have_no_error(calibrated):

@@ -13,6 +13,7 @@ from finished_session import (
     BASE_FROM_WORLD,
     evaluation,
     finished,
+    finished_on_two_mounts,
     mechanism,
     photograph,
     world_from_body,
@@ -79,6 +80,23 @@ def column(path, entity, component, timeline="station"):
     return found
 
 
+def logged(path):
+    """Lines of the log by station and level."""
+    log = {}
+    for chunk in RrdReader(path).stream().filter(content="/log").to_chunks():
+        batch = chunk.to_record_batch()
+        if "station" not in batch.schema.names:
+            continue
+        for station, text, level in zip(
+            batch.column("station").to_pylist(),
+            batch.column("TextLog:text").to_pylist(),
+            batch.column("TextLog:level").to_pylist(),
+            strict=True,
+        ):
+            log.setdefault((station, level[0]), []).append(text[0])
+    return log
+
+
 def test_the_held_out_track_reads_back_equal_to_the_bit(recording):
     track = finished().track
     numbers = read_numbers(recording)
@@ -130,18 +148,7 @@ def test_findings_stand_in_the_log_at_their_stations(tmp_path):
     path = tmp_path / "replay.rrd"
     findings = [asdict(slip), asdict(few)]
     write(path, evaluation={**evaluation(finished()), "findings": findings})
-    log = {}
-    for chunk in RrdReader(path).stream().filter(content="/log").to_chunks():
-        batch = chunk.to_record_batch()
-        if "station" not in batch.schema.names:
-            continue
-        for station, text, level in zip(
-            batch.column("station").to_pylist(),
-            batch.column("TextLog:text").to_pylist(),
-            batch.column("TextLog:level").to_pylist(),
-            strict=True,
-        ):
-            log.setdefault((station, level[0]), []).append(text[0])
+    log = logged(path)
     told_ = "SLIP the rig slipped (1.2 mm). Do: tighten it."
     assert told_ in log[4, "ERROR"]
     assert told_ in log[6, "ERROR"]
@@ -381,3 +388,33 @@ def test_each_mount_is_drawn_at_its_own_stations(tmp_path):
         assert sorted(cleared_at) == cleared
     # What no mount changes is there at all times.
     assert list(column(path, r"cell/surroundings/box\ of\ 0", "Boxes3D:half_sizes"))
+
+
+def test_a_tool_change_is_told_and_the_bodies_stay(tmp_path):
+    done = finished_on_two_mounts()
+    path = tmp_path / "replay.rrd"
+    write(
+        path,
+        mechanisms=(mechanism(), mechanism()),
+        world_from_body=world_from_body(done.session),
+        evaluation=evaluation(done),
+        **{
+            name: getattr(done, name)
+            for name in ("session", "calibration", "track", "truth")
+        },
+    )
+    assert "tool change: mount 2 (about its edge BC)" in logged(path)[8, "INFO"]
+    verdict = column(path, "verdict", "TextDocument:text")[None][0]
+    assert (
+        "Stations 0-7: mount 1 (about a normal); 8-15: mount 2 (about its edge BC)."
+        in verdict
+    )
+    assert "About a normal: White lines" in verdict
+    assert "About an edge: A white line" in verdict
+    body = rf"cell/robot/{rr.escape_entity_path_part('link/1 t')}"
+    solid = rf"{body}/mount_2/sphere\ of\ 2"
+    shown = column(path, solid, "Transform3D:translation")
+    assert sorted(shown) == list(range(8, 16))
+    # Beside the two of the track, those that it does not show.
+    tracked = column(path, solid, "Transform3D:translation", "track")
+    assert set(tracked) == {2, 3, None}

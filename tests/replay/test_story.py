@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from finished_session import finished
+from finished_session import finished, finished_on_two_mounts
 
 from handeye_tri.adjustment import adjust
 from handeye_tri.camera import Intrinsics, Lens, PinholeCamera
@@ -15,7 +15,7 @@ from handeye_tri.records import DroppedHalfTurn
 from handeye_tri.replay.half_turns import HalfTurnView, half_turn_view
 from handeye_tri.replay.shapes import vertex_normals
 from handeye_tri.replay.story import tell, worst_station
-from handeye_tri.replay.words import look_at, verdict_markdown
+from handeye_tri.replay.words import changes_of_mount, look_at, verdict_markdown
 from handeye_tri.triangle import AXES
 
 
@@ -38,6 +38,22 @@ def test_used_stations_have_both_tracks_too():
     assert np.isfinite(gaps).all()
     # The robot repeats to 0.05 mm and the cameras see to 0.03 mm.
     assert 0 < gaps.max() < 5e-4
+
+
+def test_each_station_is_told_with_its_own_mount():
+    done = finished_on_two_mounts()
+    story = story_of(done)
+    for markers in (story.observed, story.actual):
+        # Another mount holds them centimetres away.
+        assert np.linalg.norm(markers - story.reported, axis=-1).max() < 5e-4
+    assert np.abs(done.session.pixels - story.predicted).max() < 1.0
+    assert changes_of_mount(story) == [(8, "mount 2 (about its edge BC)")]
+    assert changes_of_mount(story_of(finished())) == []
+    kinds = [
+        {turn.edge is None for turn in story.turns[0][part] if turn.lines}
+        for part in (slice(8), slice(8, None))
+    ]
+    assert kinds == [{True}, {False}]
 
 
 def test_predictions_lie_where_the_markers_are_seen():

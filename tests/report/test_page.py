@@ -6,7 +6,12 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from finished_session import evaluation, finished, photograph
+from finished_session import (
+    evaluation,
+    finished,
+    finished_on_two_mounts,
+    photograph,
+)
 
 from handeye_tri.diagnose import Finding
 from handeye_tri.report import Origin, figures, geometry, render_report
@@ -17,7 +22,6 @@ from handeye_tri.report.tables import (
     quantities,
     station_mounts,
 )
-from handeye_tri.synthesize import synthesize, two_mount_geometry
 
 ORIGIN = Origin(
     cell="hp3_stereo",
@@ -320,13 +324,25 @@ def test_what_else_was_estimated_is_listed_by_its_full_name(undrawn):
     assert "Also estimated" not in text_of(page())
 
 
+def test_each_mount_has_its_numbers_and_its_stations():
+    one, both = page(), page(finished_on_two_mounts())
+    assert "How the rig sits on the flange:" in one
+    assert "flange_from_triangle_2" not in one
+    for mount, what in ((1, "a normal"), (2, "its edge BC")):
+        title = f"How the rig sits on the flange, mount {mount} (about {what})"
+        assert both.count(title) == 1
+    assert both.count("<code>flange_from_triangle_2</code>") == 1
+    assert "6 half-turns, 3 with mount 1 and 3 with mount 2 (stations" in both
+    assert "triangle at station 6, mount 1" in both
+    assert "triangle at station 14, mount 2" in both
+    head = '<th class="n">mount</th>'
+    assert (one.count(head), both.count(head)) == (0, 2)
+    assert "Also estimated" not in both
+
+
 def test_half_turns_are_counted_by_mount():
-    one = finished().session
+    one, both = finished().session, finished_on_two_mounts().session
     assert (half_turn_words(one), station_mounts(one)) == ("5 half-turns", [])
-    geometry_ = two_mount_geometry(
-        np.random.default_rng(1), half_turns=2, evaluation_stations=1
-    )
-    both, _ = synthesize(geometry_, np.random.default_rng(2), sigma_px=0.0)
-    words = "4 half-turns, 2 with mount 1 and 2 with mount 2"
+    words = "6 half-turns, 3 with mount 1 and 3 with mount 2"
     assert half_turn_words(both) == words
-    assert station_mounts(both) == ["1"] * 5 + ["2"] * 5
+    assert station_mounts(both) == ["1"] * 8 + ["2"] * 8
