@@ -11,7 +11,7 @@ from handeye_tri import arguments
 from handeye_tri.counting import counted
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.hand_eye.absolute import solve_axzb
-from handeye_tri.hand_eye.motions import relative_motions
+from handeye_tri.hand_eye.mounts import motions_by_mount, solve_mounts
 from handeye_tri.hand_eye.observed_poses import ObservedPoses, triangle_poses
 from handeye_tri.hand_eye.refine import Refinement, refine_axzb
 from handeye_tri.hand_eye.relative import RELATIVE_METHODS, solve_axxb
@@ -24,14 +24,10 @@ from handeye_tri.records import (
     motion_labels,
     triangle_name,
 )
-from handeye_tri.se3 import SE3, se3_inverse
+from handeye_tri.se3 import SE3
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
-
-# Up to here all pairs of stations with one mount are used, beyond it successive ones:
-# their number grows with the square.
-_ALL_PAIRS = 100
 
 
 def calibrate_hand_eye(
@@ -106,9 +102,15 @@ def calibrate_hand_eye(
     b = observed.reference_from_triangle
     mounts = session.mounts[stations[observed.views]]
     _check_mounts(mounts, 1 + int(session.mounts.max()))
-    xs, z = _closed_form(a, b, mounts)
+    xs, z = solve_mounts(a, b, mounts)
     refined = refine_axzb(
-        a, b, xs, z, session.repeatability.covariance, observed.covariance, mounts
+        a,
+        b,
+        list(xs.values()),
+        z,
+        session.repeatability.covariance,
+        observed.covariance,
+        mounts,
     )
     first, *others = (Mount(x, x.apply(session.triangle.points)) for x in refined.xs)
     return HandEyeCalibration(
@@ -140,37 +142,6 @@ def _check_mounts(mounts: Indices, count: int) -> None:
             "in two cameras (or in the only one, in a half-turn), and each mount needs "
             "2 or more; add stations with it, or leave its stations out"
         )
-
-
-def _closed_form(a: Floats, b: Floats, mounts: Indices) -> tuple[list[SE3], SE3]:
-    """The X of each mount and Z of ``a_i X = Z b_i``, mounts of shape (n,)."""
-    if not mounts.any():
-        x, z = solve_axzb(a, b)
-        return [x], z
-    z = solve_axxb(*_relative(a, b, mounts))
-    xs = se3_inverse(a) @ z.matrix @ b
-    return [
-        SE3.mean([SE3(x) for x in xs[mounts == mount]])
-        for mount in range(1 + int(mounts.max()))
-    ], z
-
-
-def _relative(a: Floats, b: Floats, mounts: Indices) -> tuple[Floats, Floats]:
-    """Motions in the base between stations with the same mount, as each side has it."""
-    parts = [np.flatnonzero(mounts == mount) for mount in range(1 + int(mounts.max()))]
-    left, right = (
-        np.concatenate(
-            [
-                relative_motions(
-                    poses[part],
-                    pairs="all" if len(part) <= _ALL_PAIRS else "successive",
-                )
-                for part in parts
-            ]
-        )
-        for poses in (a, b)
-    )
-    return left, right
 
 
 def _rough(
@@ -242,7 +213,7 @@ def _chi2(
 def _alternatives(a: Floats, b: Floats, mounts: Indices) -> dict[str, SE3]:
     """base_from_<first camera> by every other solver; AX = ZB knows but one mount."""
     found: dict[str, SE3] = {}
-    left, right = _relative(a, b, mounts)
+    left, right = motions_by_mount(a, b, mounts)
     for method in RELATIVE_METHODS:
         with contextlib.suppress(DegenerateMotionError):
             found[method] = solve_axxb(left, right, method=method)

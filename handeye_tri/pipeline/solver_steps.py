@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.errors import HandEyeError
-from handeye_tri.records import HandEyeCalibration, Session
+from handeye_tri.records import HandEyeCalibration, Mount, Session
 from handeye_tri.se3 import SE3, se3_inverse
 
 if TYPE_CHECKING:
@@ -59,13 +59,15 @@ def _each_alone(
     tell how far off that is.
     """
     from handeye_tri.calibrate_cameras.session_camera import alone
-    from handeye_tri.hand_eye import solve_axzb
+    from handeye_tri.hand_eye.mounts import solve_mounts
 
     before = [turn.before for turn in session.half_turns]
     after = [turn.after for turn in session.half_turns]
     reported = session.base_from_flange[before + after]
+    mounts = session.mounts[before + after]
     no_shift = np.zeros((len(session.stations), 3, 2))
-    cameras, seen, rigs = [], [], []
+    cameras, seen = [], []
+    found: list[list[SE3]] = [[] for _ in result.mounts]
     for i in range(len(session.cameras)):
         one = alone(session, i, no_shift, refine=refine)
         poses = np.concatenate(
@@ -76,19 +78,26 @@ def _each_alone(
         )
         known = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
         cameras.append(one.camera)
-        seen.append((reported[known], poses[known]))
-        rigs.append(solve_axzb(reported[known], poses[known])[0])
-    rig = SE3.mean(rigs)
+        seen.append((reported[known], mounts[known], poses[known]))
+        xs, _ = solve_mounts(reported[known], poses[known], mounts[known])
+        for mount, x in xs.items():
+            found[mount].append(x)
+    # A mount with which no camera saw a half-turn whole stays where it ends.
+    rigs = [
+        SE3.mean(those) if those else end.flange_from_triangle
+        for those, end in zip(found, result.mounts, strict=True)
+    ]
+    matrices = np.array([rig.matrix for rig in rigs])
     places = tuple(
-        SE3.mean(
-            [SE3(m) for m in base_from_flange @ rig.matrix @ se3_inverse(camera_poses)]
-        )
-        for base_from_flange, camera_poses in seen
+        SE3.mean([SE3(m) for m in base_from_flange @ matrices[of] @ se3_inverse(views)])
+        for base_from_flange, of, views in seen
     )
+    first, *others = (Mount(rig, rig.apply(session.triangle.points)) for rig in rigs)
     return replace(
         result,
         cameras=tuple(cameras),
         base_from_camera=places,
-        flange_from_triangle=rig,
-        markers=rig.apply(session.triangle.points),
+        flange_from_triangle=first.flange_from_triangle,
+        markers=first.markers,
+        other_mounts=tuple(others),
     )
