@@ -72,12 +72,14 @@ def plan_more(run: Run, half_turns: int) -> tuple[Plan, Path]:
     visited = Visited(
         session.base_from_flange[used].reshape(-1, 4, 4),
         views[used].reshape(-1, len(session.cameras)),
+        session.mounts[used],
         np.array(turns, dtype=np.intp).reshape(-1, 2),
         here,
+        0 if last is None else session.stations[last].mount,
     )
     plan = plan_next(
         run.designed_cell,
-        run.arm,
+        run.arms,
         visited,
         run.seed,
         half_turns,

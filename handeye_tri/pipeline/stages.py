@@ -36,7 +36,7 @@ def _plan(run: Run) -> tuple[list[str], str]:
     else:
         plan = plan_motions(
             run.designed_cell,
-            run.arm,
+            run.arms,
             run.seed,
             half_turns=int(run.folder.header["half_turns"]),
             progress=run.progress.advance,

@@ -41,11 +41,13 @@ class Prospect:
             half-turn, else 1.
         seen: Which cameras have all markers well in their images, shape (m,).
         joints: Joints at the stations by solution, shape (k, s, q), rad or m.
+        mount: Which mount holds the triangle there.
     """
 
     base_from_flange: Floats
     seen: Flags
     joints: Floats
+    mount: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,12 +59,14 @@ class Candidate:
         base_from_flange: Shape (s, 4, 4), metres.
         normal: Unit normal of the triangle in the world, shape (3,).
         seen: Which cameras see all markers, nothing between, shape (m,).
+        mount: Which mount holds the triangle there.
     """
 
     joints: Floats
     base_from_flange: Floats
     normal: Floats
     seen: Flags
+    mount: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +100,7 @@ class CandidateSearch:
         rng: np.random.Generator,
         rejected: Counter[str] | None = None,
         solids: Counter[str] | None = None,
+        mount: int = 0,
     ) -> None:
         """Start a search.
 
@@ -105,7 +110,9 @@ class CandidateSearch:
             rng: What poses are drawn from.
             rejected: Counts on from there.
             solids: Likewise.
+            mount: Which mount view and arm are of.
         """
+        self._mount = mount
         self._view = view
         self._arm = arm
         self._rng = rng
@@ -200,11 +207,16 @@ class CandidateSearch:
         joints = [before.joints[k] for k in places]
         if not turns:
             return [
-                Prospect(targets[k][None], seen[k], q[:, None])
+                Prospect(targets[k][None], seen[k], q[:, None], self._mount)
                 for k, q in zip(places, joints, strict=True)
             ]
         possible = [
-            Prospect(np.stack([targets[k], targets[k] @ HALF_TURN]), seen[k], both)
+            Prospect(
+                np.stack([targets[k], targets[k] @ HALF_TURN]),
+                seen[k],
+                both,
+                self._mount,
+            )
             for k, both in zip(places, self._turned(joints), strict=True)
             if len(both)
         ]
@@ -279,7 +291,9 @@ class CandidateSearch:
     def _candidate(self, prospect: Prospect, joints: Floats, seen: Flags) -> Candidate:
         world = self._arm.base_from_world.inverse().matrix
         normal = self._view.normals(world @ prospect.base_from_flange[:1])[0]
-        return Candidate(joints, self._arm.forward(joints), normal, seen)
+        return Candidate(
+            joints, self._arm.forward(joints), normal, seen, prospect.mount
+        )
 
     def _judged(self, joints: Floats, seen: Flags) -> Flags | _Forbidden:
         """Cameras left with a free sight, or what forbids joints (s, q)."""

@@ -45,6 +45,46 @@ class Relaxation:
     bound: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Kinds:
+    """Of which kind candidates are, and how many of each a choice has at least.
+
+    Attributes:
+        of: Kind of each candidate, shape (n,).
+        least: By kind.
+    """
+
+    of: NDArray[np.intp]
+    least: tuple[int, ...]
+
+    def lacking(self, members: NDArray[np.intp] | list[int]) -> list[int]:
+        """Kinds that candidates, shape (k,), have too few of."""
+        counts = np.bincount(
+            self.of[np.asarray(members, dtype=np.intp)], minlength=len(self.least)
+        )
+        return [k for k, least in enumerate(self.least) if counts[k] < least]
+
+    def instead(self, chosen: list[int], current: int) -> Flags:
+        """Candidates that may stand for one of the chosen, shape (n,)."""
+        kind = self.of[current]
+        if kind in self.lacking([k for k in chosen if k != current]):
+            return np.asarray(self.of == kind)
+        return np.ones(len(self.of), dtype=bool)
+
+    def filled(
+        self, chosen: list[int], ranked: NDArray[np.intp], wanted: int
+    ) -> list[int]:
+        """The first of ranked candidates, shape (k,), join a choice of too few."""
+        chosen = list(chosen)
+        others = [int(k) for k in ranked if k not in chosen]
+        for kind, least in enumerate(self.least):
+            missing = least - int((self.of[chosen] == kind).sum()) if chosen else least
+            own = [k for k in others if self.of[k] == kind]
+            chosen += own[: max(missing, 0)]
+        others = [k for k in others if k not in chosen]
+        return chosen + others[: wanted - len(chosen)]
+
+
 class Design:
     """Candidates, what they tell, and what a covariance costs.
 
@@ -52,7 +92,13 @@ class Design:
     identity: pixels, metres and radians differ by many orders.
     """
 
-    def __init__(self, information: Floats, prior: Floats, cost: Floats) -> None:
+    def __init__(
+        self,
+        information: Floats,
+        prior: Floats,
+        cost: Floats,
+        kinds: Kinds | None = None,
+    ) -> None:
         """Scale the problem.
 
         Args:
@@ -60,7 +106,10 @@ class Design:
             prior: Information known before, shape (p, p), positive definite.
             cost: The cost of a covariance is ``trace(cost @ covariance)``; shape
                 (p, p), positive semidefinite.
+            kinds: How many of which candidates a choice must have; None: any will do.
         """
+        alike = np.zeros(len(information), dtype=np.intp)
+        self.kinds = Kinds(alike, (0,)) if kinds is None else kinds
         total = prior + information.sum(axis=0)
         scale = 1.0 / np.sqrt(np.diag(total))
         root = np.linalg.cholesky(total * scale[:, None] * scale)
@@ -195,14 +244,13 @@ class Design:
         Fedorov's exchange (Fedorov 1972, Theory of Optimal Experiments, ch. 3).
 
         Args:
-            chosen: Where to start.
+            chosen: Where to start, with enough of each kind.
             usable: Which candidates may be chosen, shape (n,).
 
         Returns:
             As many candidates, ascending.
         """
         chosen = list(chosen)
-        members = np.flatnonzero(usable)
         weights = np.zeros(len(self))
         weights[chosen] = 1.0
         total = self._total(weights)
@@ -210,7 +258,9 @@ class Design:
             before = list(chosen)
             for place, current in enumerate(chosen):
                 without = total - self._information[current]
-                others = members[~np.isin(members, chosen)]
+                able = usable & self.kinds.instead(chosen, current)
+                able[chosen] = False
+                others = np.flatnonzero(able)
                 best = self._best(without, others, current)
                 if best != current:
                     chosen[place] = best
@@ -236,8 +286,9 @@ class Design:
         weights = np.zeros(len(self))
         weights[chosen] = 1.0
         without = self._total(weights) - self._information[chosen[place]]
-        members = np.flatnonzero(usable)
-        hopeful, costs = self._costs(without, members[~np.isin(members, chosen)], limit)
+        able = usable & self.kinds.instead(chosen, chosen[place])
+        able[chosen] = False
+        hopeful, costs = self._costs(without, np.flatnonzero(able), limit)
         return np.asarray(hopeful[costs < limit])
 
     def _costs(

@@ -12,33 +12,36 @@ from numpy.typing import NDArray
 from handeye_tri.arm import Arm
 from handeye_tri.config import Cell
 from handeye_tri.errors import InputError, NoPlanError
-from handeye_tri.plan.candidates import Candidate, CandidateSearch, Prospect
-from handeye_tri.plan.certificate import MIN_AXIS_SPREAD, certify, plane_spread_deg
-from handeye_tri.plan.design import Design
+from handeye_tri.plan.candidates import Prospect
+from handeye_tri.plan.certificate import (
+    MIN_AXIS_SPREAD,
+    Certificate,
+    certify,
+    plane_spread_deg,
+)
+from handeye_tri.plan.choosing import Chooser
 from handeye_tri.plan.information import StationInformation
-from handeye_tri.plan.poses import View
-from handeye_tri.plan.refusal import no_plan
-from handeye_tri.plan.route import RoutePlanner, Stop, unknown_speeds
-from handeye_tri.plan.selection import Selection, Selector
-from handeye_tri.plan.shortening import Shortening
-from handeye_tri.records import HalfTurn, Plan, Station
+from handeye_tri.plan.mounted import Mounted, arms_by_mount, refused
+from handeye_tri.plan.route import unknown_speeds
+from handeye_tri.plan.shortening import allowed
+from handeye_tri.plan.tour import Part, Tour
+from handeye_tri.records import HalfTurn, Plan, Station, ToolChange
 from handeye_tri.se3 import SE3
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
 Progress = Callable[[int, int], None]
 
 # Half-turns to choose from, per half-turn wanted, and at most.
 _POOL = 90
 _LARGEST_POOL = 1000
-# Selections that are tried before a cell is given up.
-_SELECTIONS = 6
-# Solutions of a place that the order may choose from.
-_SOLUTIONS = 8
+# Fewest half-turns with each of several mounts: two turn about more than one axis.
+_LEAST = 2
 
 
 def plan_motions(
     cell: Cell,
-    arm: Arm,
+    arms: Arm | Sequence[Arm],
     seed: int,
     half_turns: int | None = None,
     progress: Progress | None = None,
@@ -58,6 +61,11 @@ def plan_motions(
     programme, and the order of all stations that takes the least time: the two of a
     half-turn may be apart, and evaluation stations lie among the others.
 
+    In a cell with two mounts the half-turns of both are chosen together, at least two
+    with each, evaluation stations are shared evenly, and the order is that of least
+    time with each mount: all stations with the first, back home for the tool change,
+    then all with the other.
+
     The certificate holds what :func:`~handeye_tri.plan.certificate.certify` predicts
     from the stations, and
 
@@ -68,13 +76,14 @@ def plan_motions(
 
     Args:
         cell: The cell.
-        arm: The robot in it.
+        arms: The robot in it, by mount; alone where there is one.
         seed: Same seed, same plan.
         half_turns: Number of half-turns; the cell's own where None.
         progress: Called with (done, total) as the search goes on.
 
     Raises:
-        InputError: fewer than two half-turns are asked for.
+        InputError: fewer than two half-turns are asked for, or two by mount; or the
+            arms do not fit the cell.
         NoPlanError: no plan was found; says which check rejected how many.
     """
     wanted = cell.plan.half_turns if half_turns is None else half_turns
@@ -83,7 +92,13 @@ def plan_motions(
             f"half_turns must be at least 2, got {wanted}: one plane leaves the "
             "cameras undetermined"
         )
-    return _Planner(cell, arm, seed, wanted, progress).plan()
+    mounts = len(cell.mounted)
+    if mounts > 1 and wanted < _LEAST * mounts:
+        raise InputError(
+            f"half_turns must be at least {_LEAST * mounts}, got {wanted}: {_LEAST} "
+            f"with each of {mounts} mounts"
+        )
+    return _Planner(cell, arms_by_mount(cell, arms), seed, wanted, progress).plan()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,19 +108,23 @@ class Visited:
     Attributes:
         base_from_flange: Shape (n, 4, 4), metres.
         seen: Which cameras saw all markers there, shape (n, m).
+        mounts: Which mount held the triangle there, shape (n,).
         turns: Which of them make half-turns, shape (k, 2).
         joints: Where the arm stands now, shape (q,), rad or m.
+        mount: Which mount it carries.
     """
 
     base_from_flange: Floats
     seen: NDArray[np.bool_]
-    turns: NDArray[np.intp]
+    mounts: Ints
+    turns: Ints
     joints: Floats
+    mount: int = 0
 
 
 def plan_next(
     cell: Cell,
-    arm: Arm,
+    arms: Arm | Sequence[Arm],
     visited: Visited,
     seed: int,
     half_turns: int,
@@ -114,11 +133,13 @@ def plan_next(
     """Plan the half-turns that add most to what was seen already.
 
     The certificate is that of all stations together; the cycle time that of the new
-    ones, from where the arm stands.
+    ones, from where the arm stands. The tool is changed only where a choice with the
+    mount that the arm carries would cost more than the hundredth that a shorter
+    programme may.
 
     Args:
         cell: The cell.
-        arm: The robot in it.
+        arms: The robot in it, by mount; alone where there is one.
         visited: What was seen.
         seed: Same seed, same plan.
         half_turns: How many to add, at least 1.
@@ -128,52 +149,51 @@ def plan_next(
         The new stations alone.
 
     Raises:
-        InputError: no half-turn is asked for.
+        InputError: no half-turn is asked for, or the arms do not fit the cell.
         NoPlanError: no plan was found; says which check rejected how many.
     """
     if half_turns < 1:
         raise InputError(f"half_turns must be at least 1, got {half_turns}")
-    return _Planner(cell, arm, seed, half_turns, progress, visited).plan()
+    arms = arms_by_mount(cell, arms)
+    return _Planner(cell, arms, seed, half_turns, progress, visited).plan()
 
 
 class _Planner:
     def __init__(
         self,
         cell: Cell,
-        arm: Arm,
+        arms: Sequence[Arm],
         seed: int,
         wanted: int,
         progress: Progress | None,
         visited: Visited | None = None,
     ) -> None:
         self.cell = cell
-        self.arm = arm
         self.seed = seed
         self.wanted = wanted
         # What more is planned for needs no stations of its own to test it.
         self.held_out = 0 if visited else cell.plan.evaluation_stations
+        # Each of several mounts has its own markers to determine.
+        self.least = 0 if visited or len(arms) == 1 else _LEAST
+        self.may_stay = visited is not None
         self.visited = visited or Visited(
             np.zeros((0, 4, 4)),
             np.zeros((0, len(cell.cameras)), dtype=bool),
+            np.zeros(0, dtype=np.intp),
             np.zeros((0, 2), dtype=np.intp),
-            arm.home,
+            arms[0].home,
         )
-        self.view = View(cell)
         self.model = StationInformation(
             cell,
-            arm.base_from_world.matrix,
+            arms[0].base_from_world.matrix,
             cell.repeatability,
             cell.plan.expected_sigma_px,
         )
+        self.sides = [Mounted(cell, arm, k, seed) for k, arm in enumerate(arms)]
         self.pool_size = min(_POOL * wanted, _LARGEST_POOL)
         self.total = self.pool_size + wanted + self.held_out
         self.progress = progress
         self.done = -1
-        self.rejected: Counter[str] = Counter()
-        self.solids: Counter[str] = Counter()
-        self.route = RoutePlanner(
-            arm, cell.arm.acceleration_time_s, seed, self.rejected, self.solids
-        )
 
     def _done(self, done: int) -> None:
         if self.progress is not None and done > self.done:
@@ -182,216 +202,139 @@ class _Planner:
 
     def plan(self) -> Plan:
         """Search, choose, and order."""
-        touching = self.arm.collision(self.visited.joints)
-        if touching is not None:
-            self.rejected["path"] += 1
-            self.solids[f"{touching[0]} touches {touching[1]}"] += 1
-            raise self._no_plan(1, "the arm cannot leave where it stands", "path")
-        search = self._search(0)
-        # Half of the work is in what comes after the pool.
-        pool = search.prospects(self.pool_size, progress=lambda n: self._done(n // 2))
-        if len(pool) < self.wanted:
-            raise self._no_plan(
-                search.drawn, f"{len(pool)} of {self.wanted} half-turns found"
-            )
-        selector, selection = self._choose(pool, search)
-        route = self._route(pool, search, selector, selection.chosen)
-        plan = self._record(route, selection.bound, len(pool))
+        self._check_start()
+        visited = self.model.of_stations(
+            self.visited.base_from_flange, self.visited.seen, self.visited.mounts
+        ).sum(axis=0)
+        chooser = Chooser(self.sides, self.model, self.wanted, self.least, self._done)
+        pool = chooser.pool(self.pool_size)
+        selector, selection = chooser.choose(pool, visited)
+        limit = allowed(selector.cost(selection.chosen))
+        chosen = selection.chosen
+        if self.may_stay:
+            chosen = chooser.staying(pool, selector, chosen, self.visited.mount, limit)
+        self._done(self.pool_size + self.wanted)
+        tour = Tour(
+            sorted(self.sides, key=lambda side: side.mount != self.visited.mount),
+            pool,
+            selector,
+            self.visited.joints,
+            lambda indices: self._check_spread([pool[k] for k in indices], len(pool)),
+        )
+        parts = tour.parts(chosen, limit, self.held_out)
+        plan = self._record(parts, selection.bound, len(pool))
         self._done(self.total)
         return plan
 
-    def _search(self, stream: int) -> CandidateSearch:
-        rng = np.random.default_rng([self.seed, stream])
-        return CandidateSearch(self.view, self.arm, rng, self.rejected, self.solids)
-
-    def _choose(
-        self, pool: Sequence[Prospect], search: CandidateSearch
-    ) -> tuple[Selector, Selection]:
-        """The half-turns that tell most, free of solids."""
-        checks = 0
-
-        def checked() -> None:
-            nonlocal checks
-            checks += 1
-            half = self.pool_size // 2
-            self._done(half + int((1 - np.exp(-checks / 200)) * half))
-
-        without_solids = Counter(self.rejected)
-        design = Design(
-            self.model.of_half_turns(
-                np.array([p.base_from_flange for p in pool]),
-                np.array([p.seen for p in pool]),
-                np.zeros(len(pool), dtype=np.intp),
-            ),
-            self.model.prior
-            + self.model.of_stations(
-                self.visited.base_from_flange,
-                self.visited.seen,
-                np.zeros(len(self.visited.seen), dtype=np.intp),
-            ).sum(axis=0),
-            self.model.workspace_cost,
-        )
-
-        def tells(candidate: Candidate) -> Floats:
-            poses = candidate.base_from_flange[None]
-            return np.asarray(
-                self.model.of_half_turns(poses, candidate.seen[None], np.zeros(1, int))[
-                    0
-                ]
+    def _check_start(self) -> None:
+        """Raise where the arm touches something before it moves."""
+        touching = [
+            side
+            for side in self.sides
+            if side.touches(
+                self.visited.joints if side.mount == self.visited.mount else side.home
             )
+        ]
+        if touching:
+            what = "the arm cannot leave where it stands"
+            raise refused(touching, self.sides, 1, what, "path")
 
-        selector = Selector(design, pool, search, self.wanted, checked, tells)
-        if selector.probe() == 0:
-            by_solids = self.rejected - without_solids
-            raise self._no_plan(
-                search.drawn,
-                f"0 of {selector.checked} half-turns are free",
-                by_solids.most_common(1)[0][0],
-            )
-        selection = selector.select()
-        if selection is None:
-            by_solids = self.rejected - without_solids
-            raise self._no_plan(
-                search.drawn,
-                f"{selector.usable.sum()} of {self.wanted} half-turns are free",
-                by_solids.most_common(1)[0][0],
-            )
-        return selector, selection
-
-    def _route(
-        self,
-        pool: Sequence[Prospect],
-        search: CandidateSearch,
-        selector: Selector,
-        chosen: list[int],
-    ) -> list[tuple[Candidate, Stop]]:
-        """Stations of half-turns and of evaluation in the order of least time.
-
-        What no free way leads to is replaced.
-        """
-        self._done(self.pool_size + self.wanted)
-        held_out = self._held_out()
-        found: dict[int, list[Candidate]] = {}
-
-        def solutions(k: int) -> list[Candidate]:
-            if k not in found:
-                found[k] = search.free(search.widened(pool[k]), _SOLUTIONS)
-            return found[k]
-
-        shortening = Shortening(
-            self.route, selector, pool, lambda k: [c.joints for c in solutions(k)]
-        )
-        usual: list[int] | None = shortening.exchanged(
-            chosen,
-            [[c.joints for c in one] for one in held_out[: self.held_out]],
-            self.visited.joints,
-        )
-        for _ in range(_SELECTIONS):
-            if usual is None or len(held_out) < self.held_out:
-                break
-            self._check_spread(pool, usual)
-            places = [search.free(search.widened(pool[k]), _SOLUTIONS) for k in usual]
-            places += held_out[: self.held_out]
-            joints = [[c.joints for c in solutions] for solutions in places]
-            route = self.route.drive(joints, self.visited.joints)
-            if not isinstance(route, int):
-                return [(places[s.place][s.solution], s) for s in route]
-            if route < self.wanted:
-                usual = selector.replace(usual, usual[route])
-            else:
-                held_out.pop(route - self.wanted)
-        raise self._no_plan(
-            len(pool), "no order of stations drives free from one to the next", "path"
-        )
-
-    def _check_spread(self, pool: Sequence[Prospect], chosen: list[int]) -> None:
+    def _check_spread(self, chosen: Sequence[Prospect], pool: int) -> None:
         """Raise where all half-turns' planes are nearly parallel."""
+        seen = self.visited.turns[:, 0]
         poses = np.concatenate(
             [
-                self.visited.base_from_flange[self.visited.turns[:, 0]],
-                [pool[k].base_from_flange[0] for k in chosen],
+                self.visited.base_from_flange[seen],
+                [p.base_from_flange[0] for p in chosen],
             ]
         )
-        spread = plane_spread_deg(
-            self.model, poses, np.zeros(len(poses), dtype=np.intp)
-        )
+        mounts = np.concatenate([self.visited.mounts[seen], [p.mount for p in chosen]])
+        spread = plane_spread_deg(self.model, poses, mounts)
         if len(poses) > 1 and spread < self.cell.plan.min_plane_spread_deg:
-            self.rejected["plane_spread"] += 1
-            raise self._no_plan(
-                len(pool), f"planes differ by {spread:.0f} degrees only", "plane_spread"
-            )
+            what = f"planes differ by {spread:.0f} degrees only"
+            raise self._too_alike("plane_spread", pool, what)
 
-    def _held_out(self) -> list[list[Candidate]]:
-        """Stations anywhere in the workspace, some more than wanted."""
-        if self.held_out == 0:
-            return []
-        search = self._search(1)
-        found = search.find(2 * self.held_out, turns=False, solutions=_SOLUTIONS)
-        if len(found) < self.held_out:
-            raise self._no_plan(
-                search.drawn,
-                f"{len(found)} of {self.held_out} evaluation stations found",
-            )
-        return found
+    def _too_alike(self, check: str, drawn: int, what: str) -> NoPlanError:
+        """Refuse all half-turns together; no mount by itself fails."""
+        self.sides[0].rejected[check] += 1
+        return refused(self.sides, self.sides, drawn, what, check)
 
-    def _record(
-        self, route: list[tuple[Candidate, Stop]], bound: float, pool: int
-    ) -> Plan:
-        stations = tuple(
-            Station(
-                k,
-                "calibration" if stop.place < self.wanted else "evaluation",
-                stop.joints,
-                SE3(candidate.base_from_flange[stop.step]),
-            )
-            for k, (candidate, stop) in enumerate(route)
+    def _record(self, parts: Sequence[Part], bound: float, candidates: int) -> Plan:
+        stations: list[Station] = []
+        via: list[Floats] = []
+        pairs: list[tuple[int, int]] = []
+        seen: list[NDArray[np.bool_]] = []
+        change = None
+        seconds = 0.0
+        for part in parts:
+            visits: dict[int, list[int]] = {}
+            way = [part.start[None]]
+            for candidate, stop in part.stops:
+                if stop.place < part.turns:
+                    visits.setdefault(stop.place, []).append(len(stations))
+                stations.append(
+                    Station(
+                        len(stations),
+                        "calibration" if stop.place < part.turns else "evaluation",
+                        stop.joints,
+                        SE3(candidate.base_from_flange[stop.step]),
+                        part.mount,
+                    )
+                )
+                seen.append(candidate.seen)
+                via.append(stop.via)
+                way += [stop.via, stop.joints[None]]
+            pairs += sorted((a, b) for a, b in visits.values())
+            if part.end is not None:
+                change = ToolChange(len(stations), part.end, part.back)
+                way += [part.back, part.end[None]]
+            points = np.concatenate(way)
+            route = self.sides[part.mount].route
+            seconds += float(route.time(points[:-1], points[1:]).sum())
+        certified = self._certified(stations, seen, pairs)
+        rejected = Counter[str]()
+        for side in self.sides:
+            rejected.update(side.rejected)
+        return Plan(
+            tuple(stations),
+            tuple(HalfTurn(a, b, self.cell.axes[stations[a].mount]) for a, b in pairs),
+            dict(rejected),
+            {
+                **certified.numbers,
+                "relaxed_bound_mm": float(1e3 * np.sqrt(bound)),
+                "candidates": float(candidates),
+                "cycle_time_s": seconds,
+            },
+            self.seed,
+            certified.outcome,
+            (*certified.findings, *unknown_speeds(self.sides[0].arm)),
+            tuple(via),
+            change,
         )
-        visits: dict[int, list[int]] = {}
-        for k, (_, stop) in enumerate(route):
-            visits.setdefault(stop.place, []).append(k)
-        pairs = sorted(pair for place, pair in visits.items() if place < self.wanted)
-        used = [k for k, s in enumerate(stations) if s.kind == "calibration"]
-        before = len(self.visited.base_from_flange)
+
+    def _certified(
+        self,
+        stations: Sequence[Station],
+        seen: Sequence[NDArray[np.bool_]],
+        pairs: Sequence[tuple[int, int]],
+    ) -> Certificate:
+        """What all stations tell, those visited before among them."""
+        visited = self.visited
+        used = [s.index for s in stations if s.kind == "calibration"]
+        before = len(visited.base_from_flange)
         certified = certify(
             self.cell,
             self.model,
             np.concatenate(
                 [
-                    self.visited.base_from_flange,
-                    [route[k][0].base_from_flange[route[k][1].step] for k in used],
+                    visited.base_from_flange,
+                    [stations[k].base_from_flange.matrix for k in used],
                 ]
             ),
-            np.concatenate([self.visited.seen, [route[k][0].seen for k in used]]),
-            np.zeros(before + len(used), dtype=np.intp),
-            np.concatenate(
-                [self.visited.turns, before + np.searchsorted(used, np.array(pairs))]
-            ),
+            np.concatenate([visited.seen, [seen[k] for k in used]]),
+            np.concatenate([visited.mounts, [stations[k].mount for k in used]]),
+            np.concatenate([visited.turns, before + np.searchsorted(used, pairs)]),
         )
-        certificate = dict(certified.numbers)
-        certificate["relaxed_bound_mm"] = float(1e3 * np.sqrt(bound))
-        certificate["candidates"] = float(pool)
-        via = tuple(stop.via for _, stop in route)
-        points = np.concatenate(
-            [
-                self.visited.joints[None],
-                *(np.concatenate([stop.via, stop.joints[None]]) for _, stop in route),
-            ]
-        )
-        times = self.route.time(points[:-1], points[1:])
-        certificate["cycle_time_s"] = float(times.sum())
-        if certificate["axis_spread"] < MIN_AXIS_SPREAD:
-            self.rejected["axis_spread"] += 1
-            raise self._no_plan(1, "the rotations do not span 3-D", "axis_spread")
-        return Plan(
-            stations,
-            tuple(HalfTurn(a, b, self.cell.rig.axis) for a, b in pairs),
-            dict(self.rejected),
-            certificate,
-            self.seed,
-            certified.outcome,
-            (*certified.findings, *unknown_speeds(self.arm)),
-            via,
-        )
-
-    def _no_plan(self, drawn: int, what: str, check: str | None = None) -> NoPlanError:
-        return no_plan(self.cell.name, self.rejected, drawn, what, check, self.solids)
+        if certified.numbers["axis_spread"] < MIN_AXIS_SPREAD:
+            raise self._too_alike("axis_spread", 1, "the rotations do not span 3-D")
+        return certified

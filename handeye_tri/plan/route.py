@@ -21,8 +21,6 @@ _ROUNDS = 1000
 _MORE_ROUNDS = 100
 # Orders that are tried before it is given up.
 _ORDERS = 80
-# The start in place of an option; also the last of the configurations.
-_START = -1
 
 
 def unknown_speeds(arm: Arm) -> tuple[str, ...]:
@@ -34,6 +32,20 @@ def unknown_speeds(arm: Arm) -> tuple[str, ...]:
         f"{UNKNOWN_SPEED:g} rad/s or m/s; state it in the model (URDF: velocity, MJCF: "
         '<numeric name="speed:JOINT">)',
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Route:
+    """All stations of a programme in their order.
+
+    Attributes:
+        stops: The stations.
+        back: Points to pass on the way from the last one to where the programme ends,
+            shape (k, q), rad or m; none where it ends there.
+    """
+
+    stops: list[Stop]
+    back: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,8 +95,11 @@ class RoutePlanner:
         return travel_time(start, end, self._arm.speed, self._acceleration_time)
 
     def drive(
-        self, places: Sequence[Sequence[Floats]], start: Floats
-    ) -> list[Stop] | int:
+        self,
+        places: Sequence[Sequence[Floats]],
+        start: Floats,
+        end: Floats | None = None,
+    ) -> Route | int:
         """All stations of all places in the order of least time.
 
         The stations of a place may be apart in the order, but are reached by the
@@ -96,49 +111,77 @@ class RoutePlanner:
             places: For each its solutions, shapes (s, q): the joints at its s
                 stations.
             start: Where the arm comes from, shape (q,).
+            end: Where it goes to from the last station, shape (q,); None: nowhere.
 
         Returns:
             The stations in their order, or the place that is most in the way.
         """
-        stops, joints, visits = self._visits(places, start)
+        stops, joints, visits = self._visits(places, start, end)
+        # Configurations: the options, then where the programme starts and ends.
+        ends = [start] if end is None else [start, end]
         moves = _Moves(
-            self._arm, np.concatenate([joints, start[None]]), self._seed, self.solids
+            self._arm, np.concatenate([joints, ends]), self._seed, self.solids
         )
+        first, last = len(stops), len(stops) + 1
         order = shortest_order(visits, self._seed, _ROUNDS)
         for _ in range(_ORDERS):
-            wanted = list(pairwise([_START, *order.options]))
+            wanted = list(pairwise([first, *order.options]))
+            if end is not None:
+                wanted.append((order.options[-1], last))
             blocked = [move for move in wanted if not moves.free(*move)]
             if not blocked:
-                return [replace(stops[b], via=moves.via[a, b]) for a, b in wanted]
+                found = [
+                    replace(stops[b], via=moves.via[a, b])
+                    for a, b in wanted[: len(order.options)]
+                ]
+                none = np.zeros((0, len(start)))
+                return Route(found, moves.via.get((order.options[-1], last), none))
             if np.isfinite(order.seconds):
                 self.rejected["path"] += len(blocked)
             elif not any([moves.lead_round(*move) for move in blocked]):
                 # No order does without them, and there is no way round.
-                ends = {stops[k].place for move in blocked for k in move if k >= 0}
+                near = {stops[k].place for move in blocked for k in move if k < first}
                 barred = np.isinf(visits.times).sum(axis=1) + np.isinf(visits.first)
+                barred += np.isinf(visits.last)
                 return max(
-                    ends, key=lambda place: int(barred[visits.ways[place]].max())
+                    near, key=lambda place: int(barred[visits.ways[place]].max())
                 )
             for a, b in blocked:
                 seconds = self._seconds(moves, a, b)
-                if a == _START:
+                if a == first:
                     visits.first[b] = seconds
+                elif b == last:
+                    visits.last[a] = seconds
                 else:
                     visits.times[a, b] = visits.times[b, a] = seconds
             order = shortest_order(visits, self._seed, _MORE_ROUNDS, order)
         return stops[order.options[-1]].place
 
+    def way(self, start: Floats, end: Floats) -> Floats | None:
+        """Points to pass on a free way, shape (k, q); None where none is found."""
+        moves = _Moves(self._arm, np.array([start, end]), self._seed, self.solids)
+        if not moves.free(0, 1):
+            self.rejected["path"] += 1
+            if not moves.lead_round(0, 1):
+                return None
+        return moves.via[0, 1]
+
     def order(
-        self, places: Sequence[Sequence[Floats]], start: Floats, rounds: int
+        self,
+        places: Sequence[Sequence[Floats]],
+        start: Floats,
+        end: Floats | None,
+        rounds: int,
     ) -> tuple[float, list[Stop]]:
         """Seconds and stations of a short order; whether ways are free is not asked.
 
         Args:
             places: As for :meth:`drive`.
             start: Where the arm comes from, shape (q,).
+            end: Where it goes to from the last station, shape (q,); None: nowhere.
             rounds: How long to search.
         """
-        stops, _, visits = self._visits(places, start)
+        stops, _, visits = self._visits(places, start, end)
         order = shortest_order(visits, self._seed, rounds)
         return order.seconds, [stops[k] for k in order.options]
 
@@ -153,13 +196,19 @@ class RoutePlanner:
         )
 
     def _visits(
-        self, places: Sequence[Sequence[Floats]], start: Floats
+        self,
+        places: Sequence[Sequence[Floats]],
+        start: Floats,
+        end: Floats | None,
     ) -> tuple[list[Stop], Floats, Visits]:
         """Every way to stand at every station, its joints, and what moves take."""
         stops, ways = self._options(places)
         joints = np.array([stop.joints for stop in stops])
         visits = Visits(
-            ways, self.time(start, joints), self.time(joints[:, None], joints[None])
+            ways,
+            self.time(start, joints),
+            np.zeros(len(joints)) if end is None else self.time(joints, end),
+            self.time(joints[:, None], joints[None]),
         )
         return stops, joints, visits
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from handeye_tri.plan.candidates import Candidate, CandidateSearch, Prospect
+from handeye_tri.plan.candidates import Candidate, Prospect
 from handeye_tri.plan.design import Design
 
 Floats = NDArray[np.float64]
@@ -54,7 +54,7 @@ class Selector:
         self,
         design: Design,
         prospects: Sequence[Prospect],
-        search: CandidateSearch,
+        free: Callable[[Prospect, int], list[Candidate]],
         wanted: int,
         progress: Callable[[], None],
         tells: Callable[[Candidate], Floats],
@@ -64,14 +64,14 @@ class Selector:
         Args:
             design: Of the prospects.
             prospects: At least ``wanted``.
-            search: Checks them and counts why they fail.
+            free: Up to so many of a prospect's candidates that solids allow.
             wanted: How many to choose.
             progress: Called after each check.
             tells: Information of a checked candidate, shape (p, p).
         """
         self._design = design
         self._prospects = prospects
-        self._search = search
+        self._free = free
         self._wanted = wanted
         self._progress = progress
         self._tells = tells
@@ -84,10 +84,9 @@ class Selector:
         """A prospect that passed."""
         return self._found[index]
 
-    def probe(self) -> int:
-        """Check the first prospects; returns how many passed."""
-        first = range(min(_PROBE, len(self._prospects)))
-        return sum(self.passes(index) for index in first)
+    def probe(self, among: NDArray[np.intp]) -> int:
+        """Check the first of some prospects, shape (k,); returns how many passed."""
+        return sum(self.passes(int(index)) for index in among[:_PROBE])
 
     def passes(self, index: int) -> bool:
         """Whether solids allow a prospect; looked at once."""
@@ -95,7 +94,7 @@ class Selector:
             return True
         if not self.usable[index]:
             return False
-        free = self._search.free(self._prospects[index], 1)
+        free = self._free(self._prospects[index], 1)
         self.checked += 1
         self._progress()
         if not free:
@@ -112,13 +111,18 @@ class Selector:
             self.usable[list(self._found)] = True
         return True
 
-    def select(self) -> Selection | None:
-        """The best choice, checked; None where too few prospects pass."""
-        while self.usable.sum() >= self._wanted:
-            relaxation = self._design.relax(self._wanted, self.usable)
-            chosen = self._rounded(relaxation.weights)
+    def select(self, among: Flags | None = None) -> Selection | None:
+        """The best choice, checked; None where too few prospects pass.
+
+        Args:
+            among: Which prospects are looked at, shape (n,); None: all.
+        """
+        among = np.ones(len(self.usable), dtype=bool) if among is None else among
+        while self.enough(usable := self.usable & among):
+            relaxation = self._design.relax(self._wanted, usable)
+            chosen = self._rounded(relaxation.weights, usable)
             needed = np.flatnonzero(relaxation.weights > _SUPPORT)
-            ahead = self._design.ranked(relaxation.weights, self.usable)
+            ahead = self._design.ranked(relaxation.weights, usable)
             ahead = ahead[: _RUNNERS_UP * self._wanted]
             before = int(self.usable.sum()) - self._changed
             blocked = [k for k in {*chosen, *needed} if not self.passes(int(k))]
@@ -127,6 +131,11 @@ class Selector:
             for k in ahead:
                 self.passes(int(k))
         return None
+
+    def enough(self, usable: Flags) -> bool:
+        """Whether there are as many as wanted, and enough of each kind."""
+        members = np.flatnonzero(usable)
+        return len(members) >= self._wanted and not self._design.kinds.lacking(members)
 
     def cost(self, chosen: list[int]) -> float:
         """What a choice costs; see Design."""
@@ -142,12 +151,11 @@ class Selector:
         """The best choice without one of a choice's half-turns, checked."""
         self.usable[unwanted] = False
         chosen = [k for k in chosen if k != unwanted]
-        while self.usable.sum() >= self._wanted:
+        while self.enough(self.usable):
             weights = np.zeros(len(self._prospects))
             weights[chosen] = 1.0
             ranked = self._design.ranked(weights, self.usable)
-            missing = self._wanted - len(chosen)
-            chosen += [int(k) for k in ranked if k not in chosen][:missing]
+            chosen = self._design.kinds.filled(chosen, ranked, self._wanted)
             chosen = self._design.exchange(chosen, self.usable)
             free = [k for k in chosen if self.passes(k)]
             if len(free) == self._wanted:
@@ -155,6 +163,7 @@ class Selector:
             chosen = [k for k in free if self.usable[k]]
         return None
 
-    def _rounded(self, weights: Floats) -> list[int]:
-        start = np.argsort(-weights, kind="stable")[: self._wanted]
-        return self._design.exchange([int(k) for k in start], self.usable)
+    def _rounded(self, weights: Floats, usable: Flags) -> list[int]:
+        order = np.argsort(-weights, kind="stable")
+        start = self._design.kinds.filled([], order[usable[order]], self._wanted)
+        return self._design.exchange(start, usable)

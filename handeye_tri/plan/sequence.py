@@ -60,12 +60,15 @@ class Visits:
         ways: For each place its ways, shape (w, s): an option for each of its s
             stations, one or two.
         first: Seconds from the programme's start to each option, shape (k,).
+        last: Seconds from each option to where the programme ends, shape (k,); 0
+            where it ends at its last station.
         times: Seconds from option to option, shape (k, k), symmetric; inf where
             forbidden.
     """
 
     ways: Sequence[Ints]
     first: Floats
+    last: Floats
     times: Floats
 
 
@@ -126,10 +129,11 @@ class _Search:
 
     def __init__(self, visits: Visits) -> None:
         k = len(visits.first)
-        # Two more options: where the programme starts, and its end, free to reach.
+        # Two more options: where the programme starts, and where it ends.
         times = np.zeros((k + 2, k + 2))
         times[:k, :k] = visits.times
         times[k, :k] = visits.first
+        times[:k, k + 1] = visits.last
         self.times = np.where(np.isfinite(times), times, _FORBIDDEN)
         self.start, self.end = k, k + 1
         self.ways = visits.ways
@@ -138,7 +142,8 @@ class _Search:
             self.place[ways] = place
 
     def seconds(self, order: list[int]) -> float:
-        return float(self.times[[self.start, *order[:-1]], order].sum())
+        between = self.times[[self.start, *order[:-1]], order].sum()
+        return float(between + self.times[order[-1], self.end])
 
     def some(self, rng: np.random.Generator, order: list[int]) -> list[int]:
         """Places to take out: any, or those of successive stations."""

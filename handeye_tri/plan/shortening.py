@@ -31,82 +31,132 @@ _FIRST_ROUNDS = 500
 _ROUNDS = 150
 
 
+def allowed(cost: float) -> float:
+    """What a choice may cost for a shorter programme, the best one costing so much."""
+    return _WORSE**2 * cost
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trip:
+    """All stations with one mount, to be ordered.
+
+    Attributes:
+        mount: Which, from 0.
+        route: Orders stations.
+        others: Solutions of the stations visited besides half-turns, shapes (1, q).
+        start: Where the arm comes from, shape (q,).
+        end: Where it goes to from the last station, shape (q,); None: nowhere.
+    """
+
+    mount: int
+    route: RoutePlanner
+    others: Sequence[Sequence[Floats]]
+    start: Floats
+    end: Floats | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Gap:
+    """A trip with one of its half-turns left out.
+
+    Attributes:
+        place: Which of the chosen ones.
+        rest: Joints where the arm starts, and at the other stations, shape (n, q).
+        seconds: What the trip takes with it.
+    """
+
+    place: int
+    rest: Floats
+    seconds: float
+
+
 @dataclass(frozen=True, slots=True)
 class Shortening:
     """What exchanges need to know.
 
     Attributes:
-        route: Orders stations.
         selector: Knows what half-turns tell and which are free.
         pool: The half-turns to choose from.
         solutions: Joints by which a place is visited, shapes (2, q), by index.
     """
 
-    route: RoutePlanner
     selector: Selector
     pool: Sequence[Prospect]
     solutions: Callable[[int], Sequence[Floats]]
 
-    def exchanged(
-        self, chosen: list[int], others: Sequence[Sequence[Floats]], start: Floats
-    ) -> list[int]:
-        """Exchange half-turns while that shortens the programme.
+    def exchanged(self, chosen: list[int], trip: Trip, limit: float) -> list[int]:
+        """Exchange half-turns with one mount while that shortens its trip.
 
         Args:
-            chosen: Indices of the half-turns that tell most.
-            others: Solutions of the stations visited besides.
-            start: Where the arm comes from, shape (q,).
+            chosen: Indices of half-turns, with whichever mount.
+            trip: The stations to be ordered besides.
+            limit: What the choice may cost at most.
 
         Returns:
-            As many indices; the cost grew by no more than the limit.
+            As many indices, as many with each mount.
         """
-        limit = _WORSE**2 * self.selector.cost(chosen)
 
         def ordered(indices: list[int], rounds: int) -> tuple[float, list[int], Floats]:
-            places = [*(self.solutions(k) for k in indices), *others]
-            seconds, stops = self.route.order(places, start, rounds)
-            joints = np.array([start, *(stop.joints for stop in stops)])
+            places = [*(self.solutions(k) for k in indices), *trip.others]
+            seconds, stops = trip.route.order(places, trip.start, trip.end, rounds)
+            joints = np.array([trip.start, *(stop.joints for stop in stops)])
             return seconds, [-1, *(stop.place for stop in stops)], joints
 
-        now, visited, joints = ordered(chosen, _FIRST_ROUNDS)
+        own = [k for k in chosen if self.pool[k].mount == trip.mount]
+        if not own:
+            return chosen
+        now, visited, joints = ordered(own, _FIRST_ROUNDS)
         for _ in range(_SWEEPS):
             before = now
-            for place in range(len(chosen)):
+            for place, current in enumerate(own):
                 rest = joints[np.array(visited) != place]
-                for other in self._nearer(chosen, place, rest, limit, now):
+                gap = _Gap(chosen.index(current), rest, now)
+                for other in self._nearer(chosen, trip, gap, limit):
                     if not self.selector.passes(other):
                         continue
-                    changed = [*chosen[:place], other, *chosen[place + 1 :]]
+                    changed = [other if k == current else k for k in chosen]
                     # A camera's sight of it may have turned out blocked.
                     if self.selector.cost(changed) > limit:
                         continue
-                    found = ordered(changed, _ROUNDS)
+                    mine = [*own[:place], other, *own[place + 1 :]]
+                    found = ordered(mine, _ROUNDS)
                     if found[0] < now:
-                        chosen, (now, visited, joints) = changed, found
+                        chosen, own = changed, mine
+                        now, visited, joints = found
                         break
             if now == before:
                 break
         return chosen
 
     def _nearer(
-        self, chosen: list[int], place: int, rest: Floats, limit: float, now: float
+        self, chosen: list[int], trip: Trip, gap: _Gap, limit: float
     ) -> list[int]:
-        """What may stand for one half-turn and promises a shorter programme."""
-        able = self.selector.swaps(chosen, place, limit)
+        """What may stand for one half-turn and promises a shorter trip."""
+        able = [
+            k
+            for k in self.selector.swaps(chosen, gap.place, limit)
+            if self.pool[k].mount == trip.mount
+        ]
         if len(able) == 0:
             return []
-        pairs = [self.route.pairs(self.pool[k].joints) for k in able]
+        route, rest = trip.route, gap.rest
+        pairs = [route.pairs(self.pool[k].joints) for k in able]
         owner = np.repeat(np.arange(len(able)), [len(each) for each in pairs])
-        added = inserted(self.route.time, rest, np.concatenate(pairs))
+        added = inserted(route.time, rest, np.concatenate(pairs), trip.end)
         least = np.full(len(able), np.inf)
         np.minimum.at(least, owner, added)
-        total = self.route.time(rest[:-1], rest[1:]).sum() + least
+        total = route.time(rest[:-1], rest[1:]).sum() + least
+        if trip.end is not None:
+            total += route.time(rest[-1], trip.end)
         best = np.argsort(total, kind="stable")[:_TRIES]
-        return [int(able[k]) for k in best if total[k] < now - _LEAST_GAIN]
+        return [int(able[k]) for k in best if total[k] < gap.seconds - _LEAST_GAIN]
 
 
 def inserted(
-    time: Callable[[Floats, Floats], Floats], rest: Floats, pairs: Floats
+    time: Callable[[Floats, Floats], Floats],
+    rest: Floats,
+    pairs: Floats,
+    end: Floats | None = None,
 ) -> Floats:
     """Least seconds that two more stations add to an order.
 
@@ -114,15 +164,23 @@ def inserted(
         time: Of moves between joints (..., q).
         rest: The order, shape (n, q); the first is where it starts.
         pairs: Joints at both stations, shape (w, 2, q).
+        end: Where the order ends after its last station, shape (q,); None: there.
 
     Returns:
         Shape (w,).
     """
-    now = np.append(time(rest[:-1], rest[1:]), 0.0)
+    # Where nothing follows the last, leaving it costs nothing.
+    now = np.append(
+        time(rest[:-1], rest[1:]), 0.0 if end is None else time(rest[-1], end)
+    )
     arrive = [time(rest, pairs[:, [step]]) for step in (0, 1)]
-    # Nothing follows the last: leaving it costs nothing.
-    end = np.zeros((len(pairs), 1))
-    leave = [np.concatenate([one[:, 1:], end], axis=1) for one in arrive]
+    after = np.zeros((2, len(pairs), 1))
+    if end is not None:
+        after[..., 0] = time(pairs, end).T
+    leave = [
+        np.concatenate([one[:, 1:], last], axis=1)
+        for one, last in zip(arrive, after, strict=True)
+    ]
     together = time(pairs[:, 0], pairs[:, 1])[:, None] - now
     forth = arrive[0] + together + leave[1]
     back = arrive[1] + together + leave[0]

@@ -109,7 +109,8 @@ class ToolChange:
     """Where a programme waits for the triangle to be put on another mount.
 
     Attributes:
-        before: Index of the first station with the other mount.
+        before: Index of the first station with the other mount; 0: the robot carries
+            another one where the programme starts.
         joints: Where the robot waits, shape (q,), rad or m.
         via: Joints to pass on the way there, shape (k, q), rad or m, straight in
             joint space from one to the next.
@@ -176,7 +177,8 @@ class Plan:
         mounts = [s.mount for s in self.stations]
         changes = [k for k in range(1, len(mounts)) if mounts[k] != mounts[k - 1]]
         stated = [] if self.tool_change is None else [self.tool_change.before]
-        if changes != stated:
+        # Before the first station: the robot carries the other mount until then.
+        if changes != stated and not (stated == [0] and not changes):
             raise InputError(
                 f"the stations' mount changes before {changes or 'no station'}, the "
                 f"tool change is before {stated or 'no station'}; there must be one "

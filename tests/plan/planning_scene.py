@@ -27,14 +27,20 @@ def cell_of(name: str) -> Cell:
     return read_cell(REPO / "scenes" / f"{name}.yaml")
 
 
-@cache
 def arm_of(name: str) -> Arm:
-    return Arm(compiled(cell_of(name)))
+    """The arm with the first mount."""
+    return arms_of(name)[0]
+
+
+@cache
+def arms_of(name: str) -> tuple[Arm, ...]:
+    """The arm with each mount of a cell."""
+    return tuple(Arm(compiled(cell)) for cell in cell_of(name).mounted)
 
 
 @cache
 def plan_of(name: str, seed: int = 1) -> Plan:
-    return plan_motions(cell_of(name), arm_of(name), seed)
+    return plan_motions(cell_of(name), arms_of(name), seed)
 
 
 def calibration_of(plan: Plan) -> tuple[Floats, Floats, NDArray[np.intp]]:

@@ -18,13 +18,16 @@ from handeye_tri.simulate.compile import compile_cell
 Floats = NDArray[np.float64]
 
 
-def way_points(plan: Plan, arm: Arm) -> Floats:
-    """Joints that are passed from home on, stations and what lies between, (n, q)."""
-    ways = [
-        np.concatenate([via, station.joints[None]])
-        for station, via in zip(plan.stations, plan.via, strict=True)
-    ]
-    return np.concatenate([arm.home[None], *ways])
+def way_points(plan: Plan, arm: Arm) -> list[tuple[int, Floats]]:
+    """Joints passed with each mount from home on, back home too, (mount, (n, q))."""
+    change = plan.tool_change
+    ways = [(plan.stations[0].mount, [arm.home[None]])]
+    for station, via in zip(plan.stations, plan.via, strict=True):
+        if change is not None and change.before == station.index:
+            ways[-1][1].extend([change.via, change.joints[None]])
+            ways.append((station.mount, [change.joints[None]]))
+        ways[-1][1].extend([via, station.joints[None]])
+    return [(mount, np.concatenate(way)) for mount, way in ways]
 
 
 def driven(start: Floats, end: Floats, speed: Floats, ramp: float) -> Floats:
@@ -46,14 +49,15 @@ def driven(start: Floats, end: Floats, speed: Floats, ramp: float) -> Floats:
 
 def contacts(cell: Cell, model_path: Path, arm: Arm, plan: Plan) -> tuple[int, int]:
     """Milliseconds of a plan at which solids touch, and all of them."""
-    model, _ = compile_cell(cell, model_path)
-    data = mujoco.MjData(model)
     touching = steps = 0
-    for start, end in pairwise(way_points(plan, arm)):
-        for joints in driven(start, end, arm.speed, cell.arm.acceleration_time_s):
-            data.qpos[:] = joints
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_collision(model, data)
-            touching += int(data.ncon > 0 and data.contact.dist.min() <= 0)
-            steps += 1
+    for mount, way in way_points(plan, arm):
+        model, _ = compile_cell(cell.mounted[mount], model_path)
+        data = mujoco.MjData(model)
+        for start, end in pairwise(way):
+            for joints in driven(start, end, arm.speed, cell.arm.acceleration_time_s):
+                data.qpos[:] = joints
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_collision(model, data)
+                touching += int(data.ncon > 0 and data.contact.dist.min() <= 0)
+                steps += 1
     return touching, steps

@@ -321,6 +321,7 @@ def test_what_is_planned_next_adds_most_to_what_was_seen():
     visited = Visited(
         poses[:6],
         np.ones((6, 2), dtype=bool),
+        np.zeros(6, dtype=int),
         np.arange(6).reshape(-1, 2),
         joints[5],
     )
@@ -349,7 +350,11 @@ def test_what_is_planned_next_adds_most_to_what_was_seen():
 def test_no_half_turn_more_is_refused():
     cell, arm = scene.cell_of("hp3_stereo"), scene.arm_of("hp3_stereo")
     visited = Visited(
-        np.eye(4)[None], np.ones((1, 2), bool), np.zeros((0, 2), dtype=int), arm.home
+        np.eye(4)[None],
+        np.ones((1, 2), bool),
+        np.zeros(1, dtype=int),
+        np.zeros((0, 2), dtype=int),
+        arm.home,
     )
     with pytest.raises(InputError, match="half_turns must be at least 1, got 0"):
         plan_next(cell, arm, visited, 1, 0)

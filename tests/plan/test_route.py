@@ -12,7 +12,7 @@ from replayed import contacts, driven
 from handeye_tri.arm import Arm
 from handeye_tri.plan import plan_motions, route
 from handeye_tri.plan.paths import way_round
-from handeye_tri.plan.route import RoutePlanner
+from handeye_tri.plan.route import Route, RoutePlanner
 from handeye_tri.records import Plan, Station
 from handeye_tri.se3 import SE3
 
@@ -40,9 +40,14 @@ def test_a_way_leads_round_what_stands_between():
     np.testing.assert_array_equal(way_round(arm, start, end, seed=3), via)
 
 
-def drive(arm, places, start):
+def drive(arm, places, start, end=None):
+    """The stations in order, the place in the way, or stations and the way back."""
     rejected = Counter()
-    return RoutePlanner(arm, 0.3, 1, rejected, Counter()).drive(places, start), rejected
+    planner = RoutePlanner(arm, 0.3, 1, rejected, Counter())
+    found = planner.drive(places, start, end)
+    if isinstance(found, Route):
+        found = found.stops if end is None else found
+    return found, rejected
 
 
 def single(joints):
@@ -58,6 +63,29 @@ def test_a_route_passes_points_only_where_it_must():
     assert rejected["path"] >= 1
     near = [single(ends[0]), single(ends[0] + 0.01)]
     assert [len(stop.via) for stop in drive(arm, near, ends[0])[0]] == [0, 0]
+
+
+def test_the_way_back_is_free_and_counts():
+    """The station next to the end comes last, and the way back passes the post."""
+    arm, ends = obstructed()
+    places = [single(ends[0] + 0.02), single(ends[1]), single(ends[0] + 0.01)]
+    found, _ = drive(arm, places, ends[0], ends[1])
+    assert found.stops[-1].place == 1
+    assert len(found.back) == 0
+    found, _ = drive(arm, places, ends[0], ends[0])
+    way = [found.stops[-1].joints, *found.back, ends[0]]
+    for a, b in pairwise(way):
+        assert arm.path_collision(a, b) is None
+    assert len(found.back) + sum(len(stop.via) for stop in found.stops) > 0
+
+
+def test_a_way_is_straight_where_it_can_be(monkeypatch):
+    arm, (start, end) = obstructed()
+    planner = RoutePlanner(arm, 0.3, 1, Counter(), Counter())
+    assert planner.way(start, start + 0.01).shape == (0, 6)
+    assert len(planner.way(start, end)) > 0
+    monkeypatch.setattr(route, "can_go_round", lambda: False)
+    assert planner.way(start, end) is None
 
 
 def test_without_ompl_a_blocked_place_is_named(monkeypatch):

@@ -16,15 +16,19 @@ def distances(start, end):
     return np.linalg.norm(np.asarray(end) - start, axis=-1)
 
 
+@pytest.mark.parametrize("returns", [False, True])
 @pytest.mark.parametrize("count", [1, 2, 6])
-def test_two_stations_are_inserted_where_they_add_least(count):
+def test_two_stations_are_inserted_where_they_add_least(count, returns):
     rng = np.random.default_rng(count)
     rest, pairs = rng.random((count, 2)), rng.random((40, 2, 2))
+    end = rng.random(2) if returns else None
 
     def length(order):
+        if returns:
+            order = np.concatenate([order, end[None]])
         return distances(order[:-1], order[1:]).sum()
 
-    for pair, found in zip(pairs, inserted(distances, rest, pairs), strict=True):
+    for pair, found in zip(pairs, inserted(distances, rest, pairs, end), strict=True):
         every = []
         for a, b in product(range(1, count + 1), range(1, count + 2)):
             one = np.insert(rest, a, pair[0], axis=0)

@@ -191,6 +191,14 @@ def test_a_plan_states_its_tool_change() -> None:
     assert not change.via.flags.writeable
 
 
+def test_a_tool_change_may_come_before_the_first_station() -> None:
+    """The robot then carries the mount that the last programme ended with."""
+    change = ToolChange(0, np.zeros(6), np.zeros((0, 6)))
+    assert plan(1, 1, change=change).tool_change is change
+    with pytest.raises(InputError, match="one tool change, where the mount changes"):
+        plan(0, 1, change=change)
+
+
 @pytest.mark.parametrize(
     ("mounts", "before"),
     [((0, 0, 1), None), ((0, 0, 1), 1), ((0, 0), 1), ((0, 1, 0), 1)],
