@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from handeye_tri import arguments
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.records import numeric
-from handeye_tri.triangle import AXES, VERTICES, Axis, TriangleRig
+from handeye_tri.triangle import AXES, EDGES, VERTICES, Axis, TriangleRig
 
 Floats = NDArray[np.float64]
 
@@ -80,6 +80,21 @@ class HalfTurnData:
         result = self.offset.copy()
         result[:, :2] += (2.0 * self.about_normal)[:, None] * o
         return result
+
+    def axis_lines(self, o: Floats) -> tuple[Floats, Floats]:
+        """A point on each axis, metres, and its unit direction, (n, 3) each.
+
+        Args:
+            o: Where each axis along a normal meets the plane, shape (n, 2), metres.
+        """
+        through, along = np.zeros((2, len(self), 3))
+        for i, axis in enumerate(self.axes):
+            if axis == "normal":
+                through[i, :2], along[i, 2] = o[i], 1.0
+            else:
+                through[i], end = self.points[list(EDGES[axis])]
+                along[i] = (end - through[i]) / np.linalg.norm(end - through[i])
+        return through, along
 
 
 def check_triangle(triangle: object) -> None:

@@ -1,9 +1,14 @@
-"""Half-turns that disagree are dropped, each with the simplest account of why."""
+"""Half-turns that disagree are dropped, each with the likeliest account of why.
+
+Accounts with more freedom fit better. They are compared by their evidence, the
+likelihood averaged over all that an account allows beforehand, in Laplace's
+approximation (MacKay 1992, doi:10.1162/neco.1992.4.3.415).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
@@ -12,29 +17,34 @@ from numpy.typing import NDArray
 from handeye_tri.calibrate_cameras.closed_form import closed_form
 from handeye_tri.calibrate_cameras.half_turns import HalfTurnData
 from handeye_tri.calibrate_cameras.homography import Homographies, ImageScale, OMode
-from handeye_tri.calibrate_cameras.outliers import (
+from handeye_tri.calibrate_cameras.known_camera import (
     Build,
-    Consensus,
-    find_consensus,
+    build_of,
     fit_poses,
     joined,
     own_homography,
 )
+from handeye_tri.calibrate_cameras.outlier_tests import left_over
+from handeye_tri.calibrate_cameras.outliers import Consensus, find_consensus
 from handeye_tri.calibrate_cameras.refine import (
     HalfTurnModel,
     State,
     refine_from_starts,
 )
 from handeye_tri.calibrate_cameras.starts import blank_state, refinement_starts
+from handeye_tri.calibrate_cameras.turn_angle import OtherTurn, other_turns
 from handeye_tri.errors import DegenerateMotionError
-from handeye_tri.se3 import so3_exp
-from handeye_tri.triangle import EDGES, VERTICES
+from handeye_tri.triangle import VERTICES
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
-# Turns that are tried, degrees, then more closely about the best.
-_ANGLES = np.arange(90.0, 271.0, 3.0)
-_CLOSER = np.linspace(-3.0, 3.0, 61)
+# An angle is another than 180 degrees where it is off by so many sigmas.
+_FROM_HALF = 3.0
+# Below this no error of an angle is likelier than a smaller one, radians.
+_LEAST_OFF = float(np.radians(0.1))
+# Angles do as well as another that leave no more chi-square than this in addition.
+_ALIKE = 4.0
 # Two images are the same where no marker moved by more sigmas than this.
 _SAME = 6.0
 # Weight of a marker that is left out; zero would leave its homography undefined.
@@ -48,7 +58,7 @@ def drop_outliers(
     o_mode: OMode,
     o: Floats | None,
     noise_known: bool,
-) -> tuple[NDArray[np.intp], dict[int, str]]:
+) -> tuple[Indices, dict[int, str]]:
     """Rows of the half-turns that agree, and why each of the others does not.
 
     Args:
@@ -84,140 +94,173 @@ def drop_outliers(
     why = {}
     for row in consensus.lost:
         one = np.array([row])
-
-        def build_one(
-            part: HalfTurnData, rows: NDArray[np.intp], one: NDArray[np.intp] = one
-        ) -> HalfTurnModel:
-            return build(part, one[rows])
-
-        why[int(data.index[row])] = reason(data.take(one), build_one, consensus)
+        why[int(data.index[row])] = reason(
+            data.take(one), build_of(build, one), consensus
+        )
     return consensus.kept, why
 
 
 def reason(data: HalfTurnData, build: Build, consensus: Consensus) -> str:
     """Say why one half-turn was dropped.
 
-    Tried in this order: a repeated image, exchanged labels, a turn by another angle, a
-    wrong point. The first that makes the residuals as small as noise is the answer.
+    A repeated image is seen without any camera. Of exchanged labels, a turn by another
+    angle and a wrong point, the likeliest of those that leave nothing unexplained.
 
     Args:
         data: That half-turn alone.
         build: Makes its model.
         consensus: What the good half-turns agree on.
     """
-    row = np.zeros(1, dtype=np.intp)
     moved = data.whitener[:, 0] @ (data.pixels[:, 1] - data.pixels[:, 0])[..., None]
-    if np.sqrt(consensus.scale) * _SAME > np.abs(moved).max():
+    if np.sqrt(consensus.noise.scale) * _SAME > np.abs(moved).max():
         return "before and after are the same image: the triangle was not turned"
+    accounts = [
+        *_exchanged(data, build, consensus),
+        *_other_angles(data, build, consensus),
+        *_wrong_points(data, build, consensus),
+    ]
+    believed = [
+        one for one in accounts if one.square <= consensus.noise.limit(one.freedom)
+    ]
+    if not believed:
+        return (
+            "no half-turn of this triangle, and neither one wrong point, exchanged "
+            "labels nor another angle explains it"
+        )
+    return min(believed, key=lambda one: one.unlikeliness(consensus)).words
 
-    def misfit(changed: HalfTurnData) -> float:
-        found = own_homography(changed, consensus.state.o[0])
-        if found is None:
-            return np.inf
-        model = build(changed, row)
-        state = fit_poses(model, found, consensus.state)
-        blocks = None if state is None else model.evaluate(state)
-        return np.inf if blocks is None else blocks.cost
 
-    return (
-        _exchanged(data, misfit, consensus.limit(6))
-        or _other_angle(data, build, consensus)
-        or _wrong_point(data, misfit, build, consensus)
-        or "no half-turn of this triangle, and neither one wrong point, exchanged "
-        "labels nor another angle explains it"
-    )
+@dataclass(frozen=True, slots=True)
+class _Account:
+    """What may have happened to a half-turn.
+
+    Attributes:
+        words: It, in words.
+        square: Chi-square that it leaves.
+        freedom: Of that chi-square.
+        choices: How many equally likely cases it is one of beforehand: of a quantity,
+            its range over sqrt(2 pi) of its sigma where the noise is as stated.
+    """
+
+    words: str
+    square: float
+    freedom: int
+    choices: float
+
+    def unlikeliness(self, consensus: Consensus) -> float:
+        """-2 log of the evidence, up to what is the same for all accounts."""
+        scale = consensus.noise.scale
+        quantities = 6 - self.freedom
+        choices = self.choices * scale ** (-0.5 * quantities)
+        return self.square / scale + 2.0 * float(np.log(choices))
+
+
+def _fit(
+    changed: HalfTurnData, build: Build, consensus: Consensus
+) -> tuple[HalfTurnModel, State] | None:
+    """Half-turns before the agreed camera, as something changed; None: they do not fit.
+
+    All of them have the same pixels.
+    """
+    row = np.zeros(1, dtype=np.intp)
+    found = own_homography(changed.take(row), consensus.state.o[0])
+    if found is None:
+        return None
+    model = build(changed, np.zeros(len(changed), dtype=np.intp))
+    state = fit_poses(model, joined([found] * len(changed)), consensus.state)
+    return None if state is None else (model, state)
 
 
 def _exchanged(
-    data: HalfTurnData, misfit: Callable[[HalfTurnData], float], limit: float
-) -> str | None:
+    data: HalfTurnData, build: Build, consensus: Consensus
+) -> Iterator[_Account]:
+    orders = list(permutations(range(3)))[1:]
     for view, word in ((1, "after"), (0, "before")):
-        for order in list(permutations(range(3)))[1:]:
+        for order in orders:
             pixels, whitener = data.pixels.copy(), data.whitener.copy()
             pixels[:, view] = pixels[:, view, list(order)]
             whitener[:, view] = whitener[:, view, list(order)]
             changed = replace(data, pixels=pixels, whitener=whitener)
-            if misfit(changed) <= limit:
-                names = "".join(VERTICES[i] for i in order)
-                return f"labels exchanged {word} it: its A, B, C are {', '.join(names)}"
-    return None
+            fit = _fit(changed, build, consensus)
+            if fit is not None:
+                left = left_over(*fit, consensus.spread, np.ones(1))
+                names = ", ".join(VERTICES[i] for i in order)
+                yield _Account(
+                    f"labels exchanged {word} it: its A, B, C are {names}",
+                    float(left.square[0]),
+                    6,
+                    2.0 * len(orders),
+                )
 
 
-def _other_angle(data: HalfTurnData, build: Build, consensus: Consensus) -> str | None:
-    """The angle nearest to 180 degrees by which it may have been turned instead.
-
-    About an edge there can be two angles that fit.
-    """
-    found = own_homography(data, None)
-    if found is None:
-        return None
-    foot = consensus.state.o[0]
-
-    def squares(angles: Floats) -> Floats:
-        count = len(angles)
-        rows = np.zeros(count, dtype=np.intp)
-        rotation, offset = _turns(data, foot, angles)
-        many = replace(
-            data.take(rows),
-            rotation=rotation,
-            offset=offset,
-            about_normal=np.zeros(count),
+def _other_angles(
+    data: HalfTurnData, build: Build, consensus: Consensus
+) -> Iterator[_Account]:
+    """Turns by another angle: before a camera a triangle has up to four poses."""
+    scale = consensus.noise.scale
+    turns = other_turns(data, build, consensus.state, consensus.spread)
+    for turn in turns:
+        off = abs(turn.angle - np.pi)
+        if off < _FROM_HALF * np.sqrt(scale) * turn.sigma:
+            continue
+        alike = {
+            f"{_degrees(other):.1f}"
+            for other in turns
+            if other.square - turn.square < _ALIKE * scale
+        }
+        alike -= {f"{_degrees(turn):.1f}"}
+        sigma = np.degrees(np.sqrt(scale) * turn.sigma)
+        yield _Account(
+            f"a turn of {_degrees(turn):.1f} +- {sigma:.1g} degrees, not 180"
+            + (f"; {', '.join(sorted(alike))} would do as well" if alike else ""),
+            turn.square,
+            5,
+            # Small errors are as likely as large ones: alike in each octave.
+            2.0
+            * float(np.log(np.pi / _LEAST_OFF))
+            * max(off, _LEAST_OFF)
+            / (np.sqrt(2.0 * np.pi) * turn.sigma),
         )
-        model = build(many, rows)
-        state = fit_poses(model, joined([found] * count), consensus.state)
-        blocks = None if state is None else model.evaluate(state)
-        if blocks is None:
-            return np.full(count, np.inf)
-        return np.asarray((blocks.residuals**2).sum(axis=1))
-
-    coarse = squares(_ANGLES)
-    padded = np.concatenate([[np.inf], coarse, [np.inf]])
-    lowest = (coarse <= padded[:-2]) & (coarse <= padded[2:]) & np.isfinite(coarse)
-    for start in sorted(_ANGLES[lowest], key=lambda angle: abs(angle - 180.0)):
-        fine = squares(start + _CLOSER)
-        best = float(start + _CLOSER[np.argmin(fine)])
-        # The grid is a twentieth of a degree fine, a matter of pixels at most.
-        if fine.min() <= 4.0 * consensus.limit(5) and abs(best - 180.0) >= 0.2:
-            return f"a turn of {min(best, 360.0 - best):.1f} degrees, not 180"
-    return None
 
 
-def _turns(data: HalfTurnData, foot: Floats, angles: Floats) -> tuple[Floats, Floats]:
-    """Rotations (k, 3, 3) and translations (k, 3) of turns by angles in degrees."""
-    axis = data.axes[0]
-    if axis == "normal":
-        through, along = np.append(foot, 0.0), np.array([0.0, 0.0, 1.0])
-    else:
-        through, end = data.points[list(EDGES[axis])]
-        along = (end - through) / np.linalg.norm(end - through)
-    rotation = so3_exp(np.radians(angles)[:, None] * along)
-    return rotation, through - rotation @ through
+def _degrees(turn: OtherTurn) -> float:
+    """Between 0 and 180, either way round."""
+    return float(np.degrees(min(turn.angle, 2.0 * np.pi - turn.angle)))
 
 
-def _wrong_point(
-    data: HalfTurnData,
-    misfit: Callable[[HalfTurnData], float],
-    build: Build,
-    consensus: Consensus,
-) -> str | None:
-    costs = np.full((2, 3), np.inf)
+def _wrong_points(
+    data: HalfTurnData, build: Build, consensus: Consensus
+) -> Iterator[_Account]:
     for view, marker in np.ndindex(2, 3):
         whitener = data.whitener.copy()
         whitener[:, view, marker] *= _FAINT
-        costs[view, marker] = misfit(replace(data, whitener=whitener))
-    view, marker = np.unravel_index(int(np.argmin(costs)), costs.shape)
-    if costs[view, marker] > consensus.limit(4):
-        return None
-    whitener = data.whitener.copy()
-    whitener[:, view, marker] *= _FAINT
-    changed = replace(data, whitener=whitener)
-    row = np.zeros(1, dtype=np.intp)
-    found = own_homography(changed, consensus.state.o[0])
-    assert found is not None
-    model = build(changed, row)
-    state = fit_poses(model, found, consensus.state)
-    assert state is not None
-    missed = data.pixels - model.predict(state)
-    distance = float(np.linalg.norm(missed[0, view, marker]))
-    word = ("before", "after")[int(view)]
-    return f"marker {VERTICES[int(marker)]} {word} it is {distance:.1f} px off"
+        fit = _fit(replace(data, whitener=whitener), build, consensus)
+        if fit is None:
+            continue
+        model, state = fit
+        left = left_over(model, state, consensus.spread, np.ones(1))
+        missed = (data.pixels - model.predict(state))[0, view, marker]
+        word = ("before", "after")[view]
+        yield _Account(
+            f"marker {VERTICES[marker]} {word} it is {np.linalg.norm(missed):.1f} px "
+            "off",
+            float(left.square[0]),
+            4,
+            6.0 * _places(data, model, state, view, marker),
+        )
+
+
+def _places(
+    data: HalfTurnData, model: HalfTurnModel, state: State, view: int, marker: int
+) -> float:
+    """In how many places a point could lie in the image that the others tell apart."""
+    blocks = model.evaluate(state)
+    assert blocks is not None
+    at = 6 * view + 2 * marker
+    by_pose = blocks.own[0, at : at + 2] / _FAINT
+    covariance = np.linalg.pinv(blocks.own[0].T @ blocks.own[0], hermitian=True)
+    whitened = np.eye(2) + by_pose @ covariance @ by_pose.T
+    sigmas = np.sqrt(np.linalg.det(whitened))
+    sigmas /= np.linalg.det(data.whitener[0, view, marker])
+    width, height = data.image_size
+    return float(width * height / (2.0 * np.pi * sigmas))

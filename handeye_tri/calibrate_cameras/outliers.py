@@ -4,22 +4,21 @@ Up to a quarter of the half-turns may be bad: a wrong point, exchanged labels, a
 repeated image, a turn by another angle. (1) Each half-turn's own homography: does any
 plane fit? (2) The conic that the best three quarters agree on, by least trimmed squares
 (Rousseeuw 1984, doi:10.1080/01621459.1984.10477105) from random subsets. (3) Maximum
-likelihood on those, and a chi-square test of every half-turn against it, which the
-camera's own uncertainty is part of; repeated until nothing changes.
+likelihood on those, and a test of every half-turn against it (:mod:`outlier_tests`),
+which the camera's own uncertainty is part of; repeated until nothing changes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, fdtri
+from scipy.special import chdtri
 
 from handeye_tri.calibrate_cameras.closed_form import NOMINAL_FOCAL
-from handeye_tri.calibrate_cameras.degeneracy import is_turn, least_noise
-from handeye_tri.calibrate_cameras.extrinsics import poses_from_homographies
+from handeye_tri.calibrate_cameras.degeneracy import is_turn
 from handeye_tri.calibrate_cameras.half_turns import HalfTurnData
 from handeye_tri.calibrate_cameras.homography import (
     Homographies,
@@ -28,12 +27,30 @@ from handeye_tri.calibrate_cameras.homography import (
     constraint_covariance,
     fit_homographies,
 )
-from handeye_tri.calibrate_cameras.least_squares import NormalEquations, minimise
+from handeye_tri.calibrate_cameras.known_camera import (
+    Build,
+    build_of,
+    fit_poses,
+    joined,
+    own_homography,
+)
+from handeye_tri.calibrate_cameras.least_squares import NormalEquations
+from handeye_tri.calibrate_cameras.outlier_tests import (
+    CHANCE,
+    FALSE_DISCOVERIES,
+    FREEDOM,
+    TESTS,
+    TURN_FREEDOM,
+    Noise,
+    discovered,
+    left_over,
+)
 from handeye_tri.calibrate_cameras.refine import HalfTurnModel, State
 from handeye_tri.calibrate_cameras.special_motion import (
     intrinsics_from_conic,
     solve_conic,
 )
+from handeye_tri.calibrate_cameras.turn_angle import other_turns
 from handeye_tri.errors import DegenerateMotionError
 
 Floats = NDArray[np.float64]
@@ -42,20 +59,8 @@ Indices = NDArray[np.intp]
 # Part of the half-turns that must agree.
 _MAJORITY = 0.75
 _SUBSETS = 60
-# Chance that a good half-turn is dropped, if noise is normal and as stated.
-_CHANCE = 1e-4
-# Observations of a half-turn less its pose, camera and O being known.
-_FREEDOM = 6
-# Of a median of chi-squares of that freedom against their mean.
-_MEDIAN_EFFICIENCY = 0.58
-# Standard deviations of that median by which stated noise is contradicted.
-_CONTRADICTION = 2.33
-# Part of a residual's variance that is taken to be left at least.
-_LEAST_LEFT = 1e-3
 # Variance over what was stated beyond which nothing has been agreed upon.
 _MAX_SCALE = 1e4
-
-Build = Callable[[HalfTurnData, Indices], HalfTurnModel]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,20 +71,15 @@ class Consensus:
         kept: Rows of the half-turns that agree.
         lost: Rows of the others.
         state: Camera, poses and O from those kept.
-        scale: Factor by which the noise exceeds what was stated, squared.
-        votes: Half-turns that this factor was estimated from, none where the noise
-            is as stated.
+        spread: Covariance of camera and O where noise is as stated, shape (g, g).
+        noise: How large it is.
     """
 
     kept: Indices
     lost: Indices
     state: State
-    scale: float
-    votes: int
-
-    def limit(self, freedom: int) -> float:
-        """Largest chi-square of that freedom that a good half-turn may have."""
-        return float(_limits(np.array([freedom]), self.scale, self.votes)[0])
+    spread: Floats
+    noise: Noise
 
 
 def find_consensus(
@@ -118,64 +118,86 @@ def find_consensus(
     least = int(np.ceil(_MAJORITY * n))
     if len(sound) < least:
         raise _no_majority(n, len(sound))
-    freedom = _FREEDOM - 2.0 * data.about_normal[sound] * (o_mode == "free")
+    freedom = FREEDOM - 2.0 * data.about_normal[sound] * (o_mode == "free")
+
+    def agreed(rows: Indices) -> tuple[State, Floats]:
+        """Camera, poses and O from these rows; covariance of camera and O."""
+        part = data.take(rows)
+        model = build(part, rows)
+        state = solve(model, fit_homographies(part, o_mode, o))
+        blocks = model.evaluate(state)
+        assert blocks is not None
+        information = NormalEquations.of(blocks).reduced()
+        return state, np.asarray(
+            np.linalg.pinv(information, hermitian=True, rcond=1e-12)
+        )
+
+    def gained(i: int, kept: Indices, judge: tuple[State, Floats]) -> float:
+        """What another turn explains of a half-turn, chi-square, as the others say."""
+        row = sound[i : i + 1]
+        if row[0] in kept:
+            try:
+                judge = agreed(np.setdiff1d(kept, row))
+            except DegenerateMotionError:
+                # The others alone determine no camera, so that they cannot judge.
+                return 0.0
+        return _gain(data.take(row), build_of(build, row), each[i], *judge)
+
     core = np.sort(sound[_trimmed(joined(each), basis, least)])
     kept = core
     for _ in range(8):
-        part = data.take(kept)
-        model = build(part, kept)
-        state = solve(model, fit_homographies(part, o_mode, o))
-        square = _misfits(data, build, sound, each, model, state, kept)
+        state, spread = agreed(kept)
+        whole = build(data.take(sound), sound)
+        fitted = fit_poses(whole, joined(each), state)
+        if fitted is None:
+            raise _no_majority(n, 0)
+        sign = np.where(np.isin(sound, kept), -1.0, 1.0)
+        left = left_over(whole, fitted, spread, sign)
+        square = left.square
         # The core is the best part, at worst: its median is no median of them all.
         expected = chdtri(freedom, 1.0 - 0.5 * _MAJORITY)
         typical = float(np.median((square / expected)[np.isin(sound, core)]))
-        scale, votes = _noise(typical, len(core), noise_known)
-        excess = square / _limits(freedom, scale, votes)
-        good = sound[excess <= 1.0]
+        noise = Noise.of(typical, len(core), noise_known)
+        chance = np.minimum(
+            noise.chances(square, freedom),
+            noise.chances(left.by_angle, np.ones(len(sound))),
+        )
+        # What another turn gains is a part of what is left over: nothing to gain for
+        # most, and nothing to decide for those that are bad already.
+        most = noise.chances(square, np.full(len(sound), TURN_FREEDOM))
+        bad = TESTS * chance <= FALSE_DISCOVERIES / n
+        for i in np.flatnonzero((TESTS * most <= FALSE_DISCOVERIES) & ~bad).tolist():
+            gain = gained(i, kept, (state, spread))
+            other = noise.chances(np.array(gain), np.array(TURN_FREEDOM))
+            chance[i] = min(chance[i], float(other))
+        # Of several tests the lowest chance is as many times as likely.
+        chance = np.minimum(TESTS * chance, 1.0)
+        no_plane = np.zeros(n - len(sound))
+        dropped = discovered(np.concatenate([chance, no_plane]))[: len(sound)]
+        good = sound[~dropped]
         if len(good) < least:
-            good = np.sort(sound[np.argsort(excess)[:least]])
+            order = np.lexsort((square / freedom, -chance))
+            good = np.sort(sound[order[:least]])
         if np.array_equal(good, kept):
             break
         kept = good
-    if noise_known and scale > _MAX_SCALE:
-        raise _no_majority(n, int((square <= chdtri(freedom, _CHANCE)).sum()))
+    if noise_known and noise.scale > _MAX_SCALE:
+        raise _no_majority(n, int((square <= chdtri(freedom, CHANCE)).sum()))
     lost = np.setdiff1d(np.arange(n), kept)
-    return Consensus(kept, lost, state, scale, votes)
+    return Consensus(kept, lost, state, spread, noise)
 
 
-def _noise(typical: float, votes: int, noise_known: bool) -> tuple[float, int]:
-    """By how much the noise exceeds what was stated, and how many say so.
-
-    Noise that was stated is believed unless the half-turns contradict it: their
-    median is more than chance makes it in 1 of 100 data sets.
-
-    Args:
-        typical: Median chi-square of the half-turns over what is expected.
-        votes: How many half-turns that is the median of.
-        noise_known: Whether the noise was stated at all.
-    """
-    if not noise_known:
-        return max(typical, least_noise(0.0, noise_known)), votes
-    spread = np.sqrt(2.0 / (_MEDIAN_EFFICIENCY * _FREEDOM * votes))
-    return (1.0, 0) if typical <= 1.0 + _CONTRADICTION * spread else (typical, votes)
-
-
-def _limits(freedom: Floats, scale: float, votes: int) -> Floats:
-    """Largest chi-squares that good half-turns may have.
-
-    Chi-square's own limit where the noise is as stated; where it is more, Fisher's F,
-    since by how much is itself estimated, by a median.
-
-    Args:
-        freedom: Of each chi-square, any shape.
-        scale: Factor by which the noise exceeds what was stated, squared.
-        votes: Half-turns that this factor was estimated from, none where the noise
-            is as stated.
-    """
-    if votes == 0:
-        return np.asarray(chdtri(freedom, _CHANCE))
-    known = _MEDIAN_EFFICIENCY * _FREEDOM * votes
-    return np.asarray(scale * freedom * fdtri(freedom, known, 1.0 - _CHANCE))
+def _gain(
+    data: HalfTurnData, build: Build, own: Homographies, state: State, spread: Floats
+) -> float:
+    """By how much a turn by another angle explains a half-turn better, chi-square."""
+    model = build(data, np.zeros(1, dtype=np.intp))
+    fitted = fit_poses(model, own, state)
+    if fitted is None:
+        return 0.0
+    square = float(left_over(model, fitted, spread, np.ones(1)).square[0])
+    turns = other_turns(data, build, state, spread)
+    return max(square - min((turn.square for turn in turns), default=square), 0.0)
 
 
 def _no_majority(n: int, count: int) -> DegenerateMotionError:
@@ -184,19 +206,6 @@ def _no_majority(n: int, count: int) -> DegenerateMotionError:
         f"{int(np.ceil(_MAJORITY * n))}: check the axis, the triangle, the order of A, "
         "B, C and which images belong together"
     )
-
-
-def own_homography(data: HalfTurnData, o: Floats | None) -> Homographies | None:
-    """The homography of one half-turn alone, None where there is none.
-
-    Args:
-        data: That half-turn.
-        o: The foot of a normal axis, shape (2,), metres; None where it is not known.
-    """
-    try:
-        return fit_homographies(data, "free" if o is None else "known", o)
-    except (DegenerateMotionError, np.linalg.LinAlgError):
-        return None
 
 
 def _trimmed(joined: Homographies, basis: Floats, least: int) -> Indices:
@@ -239,73 +248,3 @@ def _trimmed(joined: Homographies, basis: Floats, least: int) -> Indices:
                 best, lowest = order, score
             b = solution(order, b)
     return best
-
-
-def _misfits(
-    data: HalfTurnData,
-    build: Build,
-    rows: Indices,
-    each: list[Homographies],
-    model: HalfTurnModel,
-    state: State,
-    kept: Indices,
-) -> Floats:
-    """Chi-square of each of the rows against what the others say, shape (r,).
-
-    The residuals of a row that the camera and O were estimated from are smaller than
-    those against an estimate without it: they spread by I - L S L', those of the other
-    rows by I + L S L', with S the covariance of camera and O and L their effect. So
-    weighed, either is the chi-square of the row against an estimate without it.
-    """
-    whole = build(data.take(rows), rows)
-    fitted = fit_poses(whole, joined(each), state)
-    if fitted is None:
-        raise _no_majority(len(data), 0)
-    blocks, known = whole.evaluate(fitted), model.evaluate(state)
-    assert blocks is not None
-    assert known is not None
-    information = NormalEquations.of(known).reduced()
-    spread = np.linalg.pinv(information, hermitian=True, rcond=1e-12)
-    # What of the camera's change a pose cannot take up.
-    pose = np.linalg.pinv(blocks.own)
-    left = blocks.shared - blocks.own @ (pose @ blocks.shared)
-    sign = np.where(np.isin(rows, kept), -1.0, 1.0)[:, None, None]
-    # Where the camera hangs on one row alone, nothing else can judge it.
-    unit = (1.0 + _LEAST_LEFT) * np.eye(blocks.residuals.shape[1])
-    wide = unit + sign * (left @ spread @ np.swapaxes(left, 1, 2))
-    solved = np.linalg.solve(wide, blocks.residuals[..., None])[..., 0]
-    return np.asarray((blocks.residuals * solved).sum(axis=1))
-
-
-def joined(each: list[Homographies]) -> Homographies:
-    """Homographies of single half-turns as those of many."""
-    return replace(
-        each[0],
-        matrix=np.concatenate([one.matrix for one in each]),
-        covariance=np.concatenate([one.covariance for one in each]),
-        o=np.concatenate([one.o for one in each]),
-    )
-
-
-def fit_poses(
-    model: HalfTurnModel, homographies: Homographies, state: State
-) -> State | None:
-    """Poses of half-turns before a known camera; None where one is behind it.
-
-    Args:
-        model: Of these half-turns.
-        homographies: One each, to start from.
-        state: Camera, lens and O; its poses are not read.
-    """
-    fx, fy, skew, cx, cy = state.intrinsics
-    k = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    n = len(model.data)
-    start = replace(
-        state,
-        poses=poses_from_homographies(k, homographies, model.data.triangle),
-        o=homographies.o if model.free_o else np.tile(state.o[0], (n, 1)),
-        turn=np.zeros((n, model.turn_unknowns)),
-    )
-    fixed = model.with_camera_known()
-    end = minimise(fixed.evaluate, fixed.retract, start, 1e-9, max_iterations=60)
-    return None if end is None else end.state

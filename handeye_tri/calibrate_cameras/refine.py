@@ -255,6 +255,21 @@ class HalfTurnModel:
             rows = np.concatenate([rows, prior], axis=1)
         return Blocks(rows[..., -1], rows[..., :size], rows[..., size:-1])
 
+    def by_angle(self, state: State, blocks: Blocks) -> Floats:
+        """Derivatives of the residuals by the angle of each turn, (n, r), per radian.
+
+        Args:
+            state: Where they are taken.
+            blocks: Residuals there.
+        """
+        through, along = self.data.axis_lines(state.o)
+        arm = self._turned(state)[0] - through[:, None]
+        moved = np.cross(along[:, None], arm)
+        result = np.zeros_like(blocks.residuals)
+        by_point = blocks.own[:, 6:12, :3].reshape(-1, 3, 2, 3)
+        result[:, 6:12] = (by_point @ moved[..., None]).reshape(-1, 6)
+        return result
+
     def retract(self, state: State, own: Floats, shared: Floats) -> State:
         """Move a state by steps of own (n, l) and shared (g,) unknowns."""
         poses = state.poses.copy()

@@ -12,9 +12,14 @@ SIGMA = 0.2
 
 
 def wrong_point(
-    scene: Scene, before: Floats, after: Floats, i: int, rng: np.random.Generator
+    scene: Scene,
+    before: Floats,
+    after: Floats,
+    i: int,
+    rng: np.random.Generator,
+    sigma: float = SIGMA,
 ) -> str:
-    del scene
+    del scene, sigma
     view, angle = (before, after)[rng.integers(2)], rng.uniform(0, 2 * np.pi)
     shift = rng.uniform(8, 60) * np.array([np.cos(angle), np.sin(angle)])
     view[i, rng.integers(3)] += shift
@@ -23,26 +28,41 @@ def wrong_point(
 
 
 def swapped(
-    scene: Scene, before: Floats, after: Floats, i: int, rng: np.random.Generator
+    scene: Scene,
+    before: Floats,
+    after: Floats,
+    i: int,
+    rng: np.random.Generator,
+    sigma: float = SIGMA,
 ) -> str:
-    del scene, before
+    del scene, before, sigma
     after[i] = after[i][[[1, 0, 2], [2, 1, 0], [0, 2, 1]][rng.integers(3)]]
     return "labels exchanged"
 
 
 def repeated(
-    scene: Scene, before: Floats, after: Floats, i: int, rng: np.random.Generator
+    scene: Scene,
+    before: Floats,
+    after: Floats,
+    i: int,
+    rng: np.random.Generator,
+    sigma: float = SIGMA,
 ) -> str:
     del scene
-    after[i] = before[i] + SIGMA * rng.integers(2) * rng.standard_normal((3, 2))
+    after[i] = before[i] + sigma * rng.integers(2) * rng.standard_normal((3, 2))
     return "same image|triangle unturned"
 
 
 def turned_by_170(
-    scene: Scene, before: Floats, after: Floats, i: int, rng: np.random.Generator
+    scene: Scene,
+    before: Floats,
+    after: Floats,
+    i: int,
+    rng: np.random.Generator,
+    sigma: float = SIGMA,
 ) -> str:
     del before
     motion = half_turn(scene.triangle, scene.axes[i], scene.foot, 170.0)
     after[i] = project(scene.camera, scene.triangle, scene.poses[i] @ motion)
-    after[i] += SIGMA * rng.standard_normal((3, 2))
-    return "a turn of 1|px off|explains it"
+    after[i] += sigma * rng.standard_normal((3, 2))
+    return "a turn of 169|a turn of 17|outside the"

@@ -257,7 +257,7 @@ def turned_by_170(pixels, truth, session, turn):
     points = session.triangle.points @ seen[:3, :3].T + seen[:3, 3]
     for i, (camera, place) in enumerate(zip(truth.cameras, places, strict=True)):
         pixels[i, turn.after] = camera.project(place.inverse().apply(points))
-    return ["left", "right"], r"a turn of 1(69|70)\.\d degrees, not 180"
+    return ["left", "right"], r"a turn of 1(69|70)\.\d \+- \S+ degrees, not 180"
 
 
 @pytest.mark.parametrize("damage", [swapped, moved_point, repeated, turned_by_170])

@@ -1,0 +1,102 @@
+"""By what other angle a triangle was turned."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from half_turn_damage import SIGMA, turned_by_170
+from half_turn_scene import IMAGE_SIZE, half_turn, make_scene
+
+from handeye_tri.calibrate_cameras import calibrate_camera
+from handeye_tri.calibrate_cameras.half_turns import read_half_turns
+from handeye_tri.calibrate_cameras.intrinsic_choice import IntrinsicChoice
+from handeye_tri.calibrate_cameras.refine import HalfTurnModel, State
+from handeye_tri.calibrate_cameras.turn_angle import other_turns, turned
+
+
+def read(scene, before, after, sigma=SIGMA):
+    data, _ = read_half_turns(
+        before, after, scene.triangle, IMAGE_SIZE, scene.axes, sigma, None
+    )
+    state = State(
+        scene.camera.intrinsics.vector,
+        np.zeros(5),
+        np.zeros((len(data), 4, 4)),
+        np.tile(scene.foot, (len(data), 1)),
+        np.zeros((len(data), 0)),
+    )
+    return data, state
+
+
+def build(data, rows):
+    return HalfTurnModel(
+        data,
+        choice=IntrinsicChoice.of(True, {}, None),
+        lens=(),
+        o_mode="shared",
+        turn_covariance=None,
+    )
+
+
+@pytest.mark.parametrize("axis", ["normal", "AB", "BC", "CA"])
+@pytest.mark.parametrize("angle", [180.0, 170.0, 75.0])
+def test_turned_data_turn_by_that_angle(axis, angle) -> None:
+    scene = make_scene(np.random.default_rng(1), 2, axis)
+    data, state = read(scene, scene.before, scene.after)
+    many = turned(data, state.o, np.radians(np.full(2, angle)))
+    motion = half_turn(scene.triangle, axis, scene.foot, angle)
+    np.testing.assert_allclose(many.rotation, [motion[:3, :3]] * 2, atol=1e-12)
+    moved = many.translation(state.o)
+    np.testing.assert_allclose(moved, [motion[:3, 3]] * 2, atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", ["normal", "AB", "BC", "CA"])
+@pytest.mark.parametrize("angle", [179.0, 170.0, 150.0, 200.0])
+def test_the_true_angle_is_among_those_that_fit(axis, angle) -> None:
+    scene = make_scene(np.random.default_rng(2), 3, axis, angle_deg=angle)
+    data, state = read(scene, scene.before, scene.after)
+    for i in range(3):
+        turns = other_turns(data.take([i]), build, state, np.zeros((7, 7)))
+        exact = [turn for turn in turns if turn.square < 1e-9]
+        off = min(abs(np.degrees(turn.angle) - angle) for turn in exact)
+        assert off < 1e-5
+
+
+def test_the_angle_s_sigma_is_its_spread() -> None:
+    scores = []
+    rng = np.random.default_rng(3)
+    scene = make_scene(rng, 20, "AB", angle_deg=172.0)
+    data, state = read(scene, *scene.noisy(rng, SIGMA))
+    for i in range(20):
+        turns = other_turns(data.take([i]), build, state, np.zeros((5, 5)))
+        scores.append(
+            min(((t.angle - np.radians(172.0)) / t.sigma for t in turns), key=abs)
+        )
+    # 20 squares of mean 1: their mean spreads by 0.32.
+    assert np.mean(np.square(scores)) == pytest.approx(1.0, abs=0.9)
+
+
+def test_a_half_turn_of_the_twin_is_told_from_one() -> None:
+    """Its turn of 170 degrees leaves as little as half-turns do in 1 of 1000."""
+    rng = np.random.default_rng([11, 14])
+    scene = make_scene(rng, 20, "BC")
+    before, after = scene.noisy(rng, SIGMA)
+    bad = rng.choice(20, 4, replace=False).tolist()
+    for i in bad:
+        turned_by_170(scene, before, after, i, rng)
+    found = calibrate_camera(
+        before,
+        after,
+        scene.triangle,
+        image_size=IMAGE_SIZE,
+        axis="BC",
+        sigma_px=SIGMA,
+        reject=True,
+    )
+    dropped = found.details["dropped"]
+    assert sorted(dropped) == sorted(bad)
+    for why in dropped.values():
+        words = why.split()
+        # a turn of 170.2 +- 0.4 degrees, not 180
+        angle, sigma = float(words[3]), float(words[5])
+        assert abs(angle - 170.0) < 4.0 * sigma + 0.05
