@@ -37,7 +37,7 @@ TURN_FREEDOM = 2.0
 # Of a median of chi-squares of that freedom against their mean.
 _MEDIAN_EFFICIENCY = 0.58
 # Standard deviations of that median by which stated noise is contradicted.
-_CONTRADICTION = 2.33
+_CONTRADICTION = 3.09
 # Part of a derivative's square below which the pose takes up all of it.
 _TAKEN_UP = 1e-9
 # Part of a residual's variance that is taken to be left at least.
@@ -62,7 +62,7 @@ class Noise:
         """From the half-turns that agree.
 
         Noise that was stated is believed unless the half-turns contradict it: their
-        median is more than chance makes it in 1 of 100 data sets.
+        median is more than chance makes it in 1 of 1000 data sets.
 
         Args:
             typical: Their median chi-square over what is expected.
