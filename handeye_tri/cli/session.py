@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from handeye_tri.cli.group import AGAIN, EXIT_CODES, SESSION, commands, example
+from handeye_tri.cli.group import (
+    AGAIN,
+    EXIT_CODES,
+    SESSION,
+    commands,
+    example,
+    seed_option,
+)
 from handeye_tri.cli.progress import StderrProgress, cap_threads
 from handeye_tri.counting import counted
 
@@ -54,13 +61,7 @@ def _conclude(run: Run, *, as_json: bool) -> None:
     type=click.Path(path_type=Path),
     help="The session's folder; made where it is absent.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=1,
-    show_default=True,
-    help="Seed of all randomness.",
-)
+@seed_option("Seed of all randomness.")
 @click.option(
     "--half-turns",
     type=click.IntRange(min=2),
@@ -90,13 +91,7 @@ def run(
 @commands.command(epilog=example("handeye-tri plan out --cell hp3_stereo --seed 1"))
 @SESSION
 @click.option("--cell", help="Start a new session for this cell.")
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=1,
-    show_default=True,
-    help="Seed of a new session.",
-)
+@seed_option("Seed of a new session.")
 @click.option(
     "--half-turns", type=click.IntRange(min=2), help="Half-turns of a new session."
 )

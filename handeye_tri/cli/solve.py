@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from handeye_tri.cli.group import EXIT_CODES, commands, example
+from handeye_tri.cli.group import EXIT_CODES, commands, example, seed_option
 from handeye_tri.cli.progress import cap_threads
 
 # Such as 0.5, and neither inf nor nan.
@@ -55,13 +55,7 @@ _POSITIVE = click.FloatRange(min=0, max=1e9, min_open=True)
     show_default=True,
     help="Largest RMS angle residual.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="Of the random samples.",
-)
+@seed_option("Of the random samples.", default=0)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON only.")
 def solve(
     poses: Path,
