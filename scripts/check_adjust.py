@@ -3,11 +3,11 @@
     python scripts/check_adjust.py --trials 300
 
 Projected points with noise: f 1720 px, baseline 0.25 m, 0.9 m away, 11 half-turns, a
-triangle of 120 and 130 mm, six held-out stations. The bound comes from numerical
-derivatives of the cameras' projections at the truth, not from the package's own
-Jacobians. NEES is the normalised estimation error squared per unknown: 1 where the
-stated covariance is right. What lies outside its gate by more than two of its own
-standard errors is named, and the exit code is 1.
+triangle of 120 and 130 mm, six held-out stations; the last row changes the triangle's
+mount half-way, 6 half-turns about a normal, then 6 about an edge. NEES is the
+normalised estimation error squared per unknown: 1 where the stated covariance is right.
+What lies outside its gate by more than two of its own standard errors is named, and the
+exit code is 1.
 """
 
 import argparse
@@ -17,6 +17,7 @@ import tracemalloc
 from dataclasses import replace
 
 import numpy as np
+from adjust_bound import bound, mean_length
 
 from handeye_tri import storage
 from handeye_tri.adjustment import adjust, joint_offsets, link_corrections
@@ -27,34 +28,45 @@ from handeye_tri.evaluate import evaluate_track
 from handeye_tri.hand_eye import calibrate_hand_eye
 from handeye_tri.plan import plan_motions
 from handeye_tri.records import (
-    MARKER_LABELS,
     Covariance,
     HandEyeCalibration,
+    Mount,
     Repeatability,
     Station,
+    marker_labels,
     motion_labels,
+    triangle_name,
 )
 from handeye_tri.se3 import SE3, se3_exp, se3_inverse
 from handeye_tri.simulate import compile_mechanism
-from handeye_tri.synthesize import Geometry, look_at, reference_geometry, synthesize
+from handeye_tri.synthesize import (
+    Geometry,
+    look_at,
+    reference_geometry,
+    synthesize,
+    two_mount_geometry,
+)
 
+# Pixels, mm, degrees; what makes the geometry.
 ROWS = (
-    (0.03, 0.0, 0.0),
-    (0.1, 0.03, 0.005),
-    (0.2, 0.1, 0.02),
-    (0.5, 0.03, 0.005),
+    (0.03, 0.0, 0.0, reference_geometry),
+    (0.1, 0.03, 0.005, reference_geometry),
+    (0.2, 0.1, 0.02, reference_geometry),
+    (0.5, 0.03, 0.005, reference_geometry),
+    (0.1, 0.03, 0.005, two_mount_geometry),
 )
 GEOMETRIES = 10
 # A robot that is right has 1; the verdict is not PASS from 1.6^2 on.
 CHI2_THAT_SAYS_SO = 2.56
 ROBOT = Repeatability(3e-5, float(np.radians(0.005)))
 BLOCKS = ("left", "right", "base_from_left", "base_from_right",
-          "reference_from_right", "flange_from_triangle", "marker")  # fmt: skip
+          "reference_from_right", "flange_from_triangle", "markers",
+          "flange_from_triangle_2", "markers_2")  # fmt: skip
 # Track error over the bound, with and without errors of the robot; NEES; coverage, %.
 BOUND, WRONG_BOUND = 1.04, 1.3
 NEES = (0.93, 1.07)
 COVERAGE = (93.0, 97.0)
-SIZES = dict(zip(BLOCKS, (5, 5, 6, 6, 6, 6, 9), strict=True))
+SIZES = dict(zip(BLOCKS, (5, 5, 6, 6, 6, 6, 9, 6, 9), strict=True))
 
 
 def rough(truth, rng):
@@ -77,9 +89,11 @@ def rough(truth, rng):
 
     frame = moved(truth.flange_from_triangle)
     points = truth.flange_from_triangle.inverse().apply(truth.markers)
+    places = tuple(moved(motion) for motion in truth.base_from_camera)
+    others = [moved(mount.flange_from_triangle) for mount in truth.other_mounts]
     return HandEyeCalibration(
         cameras,
-        tuple(moved(motion) for motion in truth.base_from_camera),
+        places,
         frame,
         frame.apply(points),
         Covariance(("none.x",), np.eye(1)),
@@ -87,94 +101,18 @@ def rough(truth, rng):
         1,
         np.zeros((1, 6)),
         "drawn",
+        other_mounts=tuple(Mount(motion, motion.apply(points)) for motion in others),
     )
-
-
-def forward(truth, poses, change, own):
-    """Pixels (m, n, 3, 2) with the 31 shared unknowns and each pose changed."""
-    poses = poses @ se3_exp(own)
-    markers = truth.markers + change[-9:].reshape(3, 3)
-    points = np.einsum("nab,kb->nka", poses[:, :3, :3], markers)
-    points = points + poses[:, None, :3, 3]
-    views = []
-    for i, camera in enumerate(truth.cameras):
-        step = change[11 * i : 11 * i + 11]
-        place = truth.base_from_camera[i] @ SE3.exp(step[5:])
-        vector = camera.intrinsics.vector + step[:5]
-        seen = PinholeCamera(
-            camera.name, Intrinsics.from_vector(vector), camera.image_size
-        )
-        views.append(seen.project(place.inverse().apply(points)))
-    return np.array(views)
-
-
-def slopes(truth, poses):
-    """Derivatives of pixels by the shared unknowns and by each pose, by differences."""
-    g = 31
-    step = np.r_[np.tile([*[1e-2] * 5, *[1e-5] * 6], 2), np.full(9, 1e-5)]
-    zero, still = np.zeros(g), np.zeros((len(poses), 6))
-    shared, own = [], []
-    for k in range(g):
-        change = step[k] * np.eye(g)[k]
-        plus = forward(truth, poses, change, still)
-        shared.append((plus - forward(truth, poses, -change, still)) / (2 * step[k]))
-    for k in range(6):
-        turn = 1e-5 * np.eye(6)[k]
-        plus = forward(truth, poses, zero, still + turn)
-        own.append((plus - forward(truth, poses, zero, still - turn)) / 2e-5)
-    return np.stack(shared, -1), np.stack(own, -1)
-
-
-def bound(session, truth, sigma_px, robot):
-    """Covariances of observed less reported that no unbiased estimator beats."""
-    reported = session.base_from_flange
-    kinds = np.array([station.kind == "calibration" for station in session.stations])
-    seen = np.isfinite(session.pixels)[..., None]
-    shared, own = slopes(truth, reported)
-    shared, own = (np.where(seen, slope, 0.0) / sigma_px for slope in (shared, own))
-    information = np.zeros((31, 31))
-    for j in np.flatnonzero(kinds):
-        by_shared, by_own = shared[:, j].reshape(-1, 31), own[:, j].reshape(-1, 6)
-        noise = np.eye(len(by_own)) + by_own @ robot.covariance @ by_own.T
-        information += by_shared.T @ np.linalg.solve(noise, by_shared)
-    scale = 1 / np.sqrt(np.diagonal(information))
-    covariance = np.linalg.inv(information * np.outer(scale, scale))
-    covariance *= np.outer(scale, scale)
-    parts = []
-    for j in np.flatnonzero(~kinds):
-        rotation = reported[j, :3, :3]
-        for k in range(3):
-            if not seen[:, j, k].all():
-                continue
-            # A point's slope is that of the pose's translation, turned into the base.
-            by_point = own[:, j, k].reshape(-1, 6)[:, :3] @ rotation.T
-            by_camera = shared[:, j, k].reshape(-1, 31).copy()
-            by_camera[:, -9:] = 0.0
-            inverse = np.linalg.inv(by_point.T @ by_point)
-            slope = -inverse @ by_point.T @ by_camera
-            slope[:, 22 + 3 * k : 25 + 3 * k] -= rotation
-            lever = truth.markers[k]
-            cross = np.cross(np.eye(3), lever).T
-            by_robot = rotation @ np.hstack([np.eye(3), -cross.T])
-            parts.append(
-                slope @ covariance @ slope.T
-                + inverse
-                + by_robot @ robot.covariance @ by_robot.T
-            )
-    return np.array(parts)
-
-
-def mean_length(covariances, rng):
-    """Mean length of normal errors with these covariances, m."""
-    roots = np.linalg.cholesky(covariances)
-    draws = roots @ rng.standard_normal((len(roots), 3, 4000))
-    return float(np.linalg.norm(draws, axis=1).mean())
 
 
 def truth_less_estimate(found, truth):
     values = {}
-    motions = {"flange_from_triangle": (found.flange_from_triangle,
-                                        truth.flange_from_triangle)}  # fmt: skip
+    first = Mount(truth.flange_from_triangle, truth.markers)
+    mounts = list(zip(found.mounts, (first, *truth.other_mounts), strict=True))
+    motions = {
+        triangle_name(k): (mine.flange_from_triangle, true.flange_from_triangle)
+        for k, (mine, true) in enumerate(mounts)
+    }
     for i, (mine, true) in enumerate(zip(found.cameras, truth.cameras, strict=True)):
         difference = true.intrinsics.vector - mine.intrinsics.vector
         for name, value in zip(
@@ -190,8 +128,17 @@ def truth_less_estimate(found, truth):
     for owner, (mine, true) in motions.items():
         tangent = (mine.inverse() @ true).log()
         values |= dict(zip(motion_labels(owner), tangent, strict=True))
-    off = (truth.markers - found.markers).ravel()
-    return values | dict(zip(MARKER_LABELS, off, strict=True))
+    for k, (mine, true) in enumerate(mounts):
+        off = (true.markers - mine.markers).ravel()
+        values |= dict(zip(marker_labels(k), off, strict=True))
+    return values
+
+
+def labels_of(block, off):
+    """Labels of a block; none where the cell has no second mount."""
+    if block.startswith("markers"):
+        return [x for x in marker_labels(int(block == "markers_2")) if x in off]
+    return [x for x in off if x.startswith(f"{block}.")]
 
 
 def statistics(trials, separate):
@@ -202,7 +149,7 @@ def statistics(trials, separate):
         "track/predicted  coverage 95 %"
     )
     tables, problems = [], []
-    for sigma_px, mm, degrees in ROWS:
+    for sigma_px, mm, degrees, make in ROWS:
         robot = Repeatability(1e-3 * mm, float(np.radians(degrees)))
         rng = np.random.default_rng(0)
         limits = []
@@ -210,9 +157,7 @@ def statistics(trials, separate):
         inside = {name: [] for name in BLOCKS}
         joint, chi2, steps = [], [], []
         for trial in range(trials):
-            geometry = reference_geometry(
-                np.random.default_rng([1, trial % GEOMETRIES])
-            )
+            geometry = make(np.random.default_rng([1, trial % GEOMETRIES]))
             session, truth = synthesize(
                 geometry,
                 np.random.default_rng([2, trial]),
@@ -230,8 +175,9 @@ def statistics(trials, separate):
             found = adjust(session, start)
             off = truth_less_estimate(found, truth)
             for name in BLOCKS:
-                labels = [x for x in off if x.startswith(f"{name}.")
-                          or (name == "marker" and x in MARKER_LABELS)]  # fmt: skip
+                labels = labels_of(name, off)
+                if not labels:
+                    continue
                 error = np.array([off[label] for label in labels])
                 matrix = found.covariance.block(labels)
                 scores[name].append(error @ np.linalg.solve(matrix, error) / len(error))
@@ -245,12 +191,15 @@ def statistics(trials, separate):
         limit = np.array([limits[t % GEOMETRIES] for t in range(trials)])
         squares = np.sqrt((rms**2).mean())
         over = squares / np.sqrt((limit[:, 1] ** 2).mean())
-        every = np.concatenate([np.concatenate(inside[name]) for name in BLOCKS])
-        row = f"{sigma_px} px, {mm} mm"
+        blocks = [name for name in BLOCKS if inside[name]]
+        every = np.concatenate([np.concatenate(inside[name]) for name in blocks])
+        row = f"{sigma_px} px {mm} mm"
+        if make is two_mount_geometry:
+            row = "two mounts"
         # The scatter of the mean square of the held-out track over the trials.
         spread = (rms**2).std() / (rms**2).mean() / (2 * np.sqrt(trials))
         problems += missed(f"{row}: track over the bound", over, 0, BOUND, spread)
-        whole = 100 * np.array([np.concatenate([inside[n][t] for n in BLOCKS]).mean()
+        whole = 100 * np.array([np.concatenate([inside[n][t] for n in blocks]).mean()
                                 for t in range(trials)])  # fmt: skip
         problems += missed(f"{row}: coverage, %", whole.mean(), *COVERAGE,
                            whole.std() / np.sqrt(trials))  # fmt: skip
@@ -260,14 +209,19 @@ def statistics(trials, separate):
             f"{over:12.3f}"
             f"{np.mean(chi2):17.3f}"
             f"{squares / np.sqrt((predicted**2).mean()):14.3f}"
-            f"{100 * every.mean():17.1f}",
+            f"{100 * every.mean():17.1f}"
+            + ("  two mounts" if row == "two mounts" else ""),
             flush=True,
         )
         tables.append((row, scores, inside))
-    print("\nNEES, coverage in %          " + "   ".join(f"{r[0]:<12}" for r in ROWS))
+    heads = [f"{row.removesuffix(' mm'):<12}" for row, _, _ in tables]
+    print("\nNEES, coverage in %   " + "    ".join(heads))
     for name in BLOCKS:
         cells = []
         for row, scores, inside in tables:
+            if not scores[name]:
+                cells.append("")
+                continue
             nees, cover = np.mean(scores[name]), 100 * np.mean(inside[name], axis=1)
             cells.append(f"{nees:.3f}  {cover.mean():.1f}")
             error = np.sqrt(2 / SIZES[name] / trials)
