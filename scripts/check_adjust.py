@@ -215,7 +215,7 @@ def statistics(trials, separate):
         )
         tables.append((row, scores, inside))
     heads = [f"{row.removesuffix(' mm'):<12}" for row, _, _ in tables]
-    print("\nNEES, coverage in %   " + "    ".join(heads))
+    print("\nNEES, coverage in %     " + "    ".join(heads))
     for name in BLOCKS:
         cells = []
         for row, scores, inside in tables:
@@ -228,7 +228,7 @@ def statistics(trials, separate):
             problems += missed(f"{row}: NEES of {name}", nees, *NEES, error)
             problems += missed(f"{row}: coverage of {name}, %", cover.mean(), *COVERAGE,
                                cover.std() / np.sqrt(trials))  # fmt: skip
-        print(f"{name:22}" + "    ".join(f"{cell:<12}" for cell in cells))
+        print(f"{name:24}" + "    ".join(f"{cell:<12}" for cell in cells))
     return problems
 
 
