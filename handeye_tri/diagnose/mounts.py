@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from handeye_tri.diagnose.gates import Finding
 from handeye_tri.diagnose.odd_views import OddView
-from handeye_tri.records import Session
+from handeye_tri.records import HalfTurn, Session
 from handeye_tri.triangle import AXES, EDGES, Axis
 
 Floats = NDArray[np.float64]
@@ -70,6 +70,25 @@ def shown_mounts(session: Session, seen: Session) -> Indices:
     return result
 
 
+def other_changes(session: Session) -> Iterator[Session]:
+    """The session with its tool change before other stations, where it has one.
+
+    No half-turn goes on over it, and what half-turns turn about stays as it is.
+    """
+    mounts = session.mounts
+    steps = np.flatnonzero(np.diff(mounts)) + 1
+    if len(steps) != 1:
+        return
+    for station in range(1, len(mounts)):
+        parts = any(
+            min(turn.before, turn.after) < station <= max(turn.before, turn.after)
+            for turn in session.half_turns
+        )
+        if station != steps[0] and not parts:
+            later = np.arange(len(mounts)) >= station
+            yield with_mounts(session, np.where(later, mounts[-1], mounts[0]))
+
+
 def with_mounts(session: Session, mounts: Indices) -> Session:
     """The session with other mounts, shape (n,)."""
     stations = tuple(
@@ -98,28 +117,36 @@ def _seen_axis(moved: Floats, recorded: Axis) -> Axis:
 
 
 def mount_findings(
-    session: Session, seen: Session, odd: Sequence[OddView]
+    session: Session,
+    mounts: Indices,
+    half_turns: Sequence[HalfTurn],
+    odd: Sequence[OddView],
 ) -> list[Finding]:
     """Stations at which the triangle was on another mount than is recorded.
 
     Args:
         session: As recorded.
-        seen: The same, or with the mounts and axes that its half-turns show.
-        odd: Views of that, of which those of the kind "mount" are told.
+        mounts: With which the views were judged, shape (n,).
+        half_turns: The session's, about the axes that they show.
+        odd: Views, of which those of the kind "mount" are told.
     """
     mine = [view for view in odd if view.kind == "mount"]
-    shown, told = shown_mounts(session, seen), []
+    shown, told = mounts.copy(), []
     for view in mine:
         shown[view.station] = int(view.reading) - 1
-    if (shown == session.mounts).all():
+    wrong = shown != session.mounts
+    if not wrong.any():
         return []
     turns = [
         f"{turn.before} and {turn.after} about {_axis_name(turn.axis)}"
-        for turn, other in zip(seen.half_turns, session.half_turns, strict=True)
+        for turn, other in zip(half_turns, session.half_turns, strict=True)
         if turn.axis != other.axis
     ]
     if turns:
         told.append(f"the markers show half-turns between stations {', '.join(turns)}")
+    elif (mounts != session.mounts).any():
+        told.append("so read, robot and cameras fit; as recorded they do not")
+    mine = [view for view in mine if wrong[view.station]]
     if mine:
         stations = sorted({view.station for view in mine})
         residual, left = (

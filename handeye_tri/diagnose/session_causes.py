@@ -45,8 +45,8 @@ class Evidence:
         joints: The joints' offsets, where there is a model of the robot.
         edges: How wide each marker's edge is, (m, n, 3, 3): mean variance and both
             parts of its elongation, px^2; None where nobody measured it.
-        recorded: The session as recorded, where ``session`` has other mounts, which
-            its half-turns show; None where it is that.
+        recorded: The session as recorded, where ``session`` has other mounts, with
+            which it calibrates; None where it is that.
     """
 
     session: Session
@@ -95,7 +95,9 @@ def session_causes(evidence: Evidence) -> tuple[Finding, ...]:
     names = [info.name for info in session.cameras]
     findings = [
         *image_findings(session, blurred, evidence.edges, views_due(loop, fit)),
-        *mount_findings(evidence.recorded or session, session, odd),
+        *mount_findings(
+            evidence.recorded or session, session.mounts, session.half_turns, odd
+        ),
         *_odd_findings(odd, names),
         *turn_findings(session, {c.station for c, _, _ in found if c.kind == "pose"}),
         *_cause_findings(found, names, "BLUR" if blurred else ""),

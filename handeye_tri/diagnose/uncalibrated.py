@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations
@@ -19,6 +20,7 @@ from handeye_tri.diagnose.gates import Finding, Verdict
 from handeye_tri.diagnose.images import blurred_views, image_findings
 from handeye_tri.diagnose.mounts import (
     mount_findings,
+    other_changes,
     seen_turns,
     shown_mounts,
     with_mounts,
@@ -33,7 +35,12 @@ from handeye_tri.hand_eye import (
     solve_readings,
 )
 from handeye_tri.hand_eye.observed_poses import triangle_poses
-from handeye_tri.records import CameraCalibration, PosePairs, Session
+from handeye_tri.records import (
+    CameraCalibration,
+    HandEyeCalibration,
+    PosePairs,
+    Session,
+)
 from handeye_tri.se3 import so3_log
 from handeye_tri.triangle import VERTICES
 
@@ -76,12 +83,13 @@ def why_uncalibrated(
     """Name what is wrong with a session on which calibration gave up.
 
     Half-turns that turn about the axis of another mount than is recorded are seen at
-    once. Where the cameras calibrate, robot and cameras contradict each other, and the
-    readings of bare pose pairs are solved: inverted, shifted, in another unit. Where
-    they do not, images that belong to the next or the last station, or markers that
-    bear each other's names everywhere, would make half-turns that are none. Last, the
-    cameras are calibrated from those half-turns that agree, or else as if the motions
-    were general ones, and the causes of :func:`session_causes` compete on that.
+    once. Where the cameras calibrate, robot and cameras contradict each other: the tool
+    change is tried before other stations, and the readings of bare pose pairs are
+    solved: inverted, shifted, in another unit. Where they do not, images that belong to
+    the next or the last station, or markers that bear each other's names everywhere,
+    would make half-turns that are none. Last, the cameras are calibrated from those
+    half-turns that agree, or else as if the motions were general ones, and the causes
+    of :func:`session_causes` compete on that.
 
     Args:
         session: What was detected.
@@ -99,10 +107,12 @@ def why_uncalibrated(
         return tuple(findings)
     seen = seen_turns(session)
     if seen.half_turns != session.half_turns and _cameras(seen) is not None:
-        return _on_other_mounts(session, seen, joints, edges)
+        return _on_seen_mounts(session, seen, joints, edges)
     cameras = _cameras(session)
     if cameras is not None:
-        return _readings(session.without(cameras.details["dropped"]), cameras)
+        return _with_another_change(session, cameras, joints, edges) or _readings(
+            session.without(cameras.details["dropped"]), cameras
+        )
     # Shifted by two, half-turns are half-turns again: only robot and cameras together
     # tell which way.
     misfits = {word: _misfit(_shifted(session, k)) for k, word in _SHIFTS.items()}
@@ -181,20 +191,42 @@ def _on_general_motions(
         return ()
 
 
-def _on_other_mounts(
+def _on_seen_mounts(
     session: Session,
     seen: Session,
     joints: RobotParameters | None,
     edges: Floats | None,
 ) -> tuple[Finding, ...]:
     """What is wrong, where half-turns turn about the axis of another mount."""
+    mounts = shown_mounts(session, seen)
     try:
-        shown = with_mounts(seen, shown_mounts(session, seen))
+        shown = with_mounts(seen, mounts)
         cameras = calibrate_session_cameras(shown)
         lost = cameras.details["dropped"]
         calibration = calibrate_hand_eye(shown.without(lost), cameras)
     except HandEyeError:
-        return tuple(mount_findings(session, seen, ()))
+        return tuple(mount_findings(session, mounts, seen.half_turns, ()))
+    return session_causes(Evidence(shown, calibration, lost, joints, edges, session))
+
+
+def _with_another_change(
+    session: Session,
+    cameras: CameraCalibration,
+    joints: RobotParameters | None,
+    edges: Floats | None,
+) -> tuple[Finding, ...]:
+    """What is wrong, where the tool change fits before another station."""
+    lost = cameras.details["dropped"]
+    best: tuple[float, Session, HandEyeCalibration] | None = None
+    for other in other_changes(session):
+        with contextlib.suppress(HandEyeError):
+            found = calibrate_hand_eye(other.without(lost), cameras)
+            misfit = found.chi2 / found.dof
+            if misfit < (_BELIEVED if best is None else best[0]):
+                best = misfit, other, found
+    if best is None:
+        return ()
+    _, shown, calibration = best
     return session_causes(Evidence(shown, calibration, lost, joints, edges, session))
 
 
