@@ -6,11 +6,12 @@ import adjust_scene
 import numpy as np
 import pytest
 
-from handeye_tri.adjustment import adjust
+from handeye_tri.adjustment import Loss, adjust, clock_offset
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
 from handeye_tri.errors import DegenerateMotionError, InputError
 from handeye_tri.evaluate import compare_with_truth, evaluate_track
 from handeye_tri.hand_eye import calibrate_hand_eye
+from handeye_tri.se3 import SE3
 from handeye_tri.synthesize import synthesize, two_mount_geometry
 
 
@@ -111,3 +112,77 @@ def test_a_mount_that_shows_too_little_is_named():
         adjust(adjust_scene.hide(session, hidden), start, side_sigma=0.0)
     with pytest.raises(InputError, match="start knows 1 mount .* have 2;"):
         adjust(session, replace(start, other_mounts=()))
+
+
+def moved_robot(session, tangents):
+    """The session as a robot reports it that stands off by tangents (n, 6)."""
+    return replace(
+        session,
+        stations=tuple(
+            replace(s, base_from_flange=s.base_from_flange @ SE3.exp(-tangent))
+            for s, tangent in zip(session.stations, tangents, strict=True)
+        ),
+    )
+
+
+def test_a_clock_offset_is_found_at_the_stations_of_both_mounts():
+    session, truth, start = adjust_scene.cell(
+        2, axes=("normal", "BC"), sigma_px=0.0, half_turns=5
+    )
+    rng = np.random.default_rng(4)
+    # Some centimetres and degrees a second.
+    twist = rng.normal(size=(len(session.stations), 6)) * np.repeat([0.05, 0.1], 3)
+    late = moved_robot(session, 0.02 * twist)
+    late = replace(late, repeatability=adjust_scene.ROBOT)
+    found = adjust(late, start, robot_parameters=clock_offset(twist))
+    sigma = found.covariance.std("clock.offset")
+    # Pixels without noise, believed to 1 px: the parameter's prior hardly pulls.
+    assert found.robot["clock.offset"] == pytest.approx(0.02, abs=0.1 * sigma)
+    assert found.chi2 < 0.5
+    without = adjust(late, start)
+    assert without.chi2 > 20 * found.chi2
+    for mine, true in zip(found.other_mounts, truth.other_mounts, strict=True):
+        np.testing.assert_allclose(mine.markers, true.markers, atol=1e-4)
+
+
+def test_residuals_are_in_the_frame_of_the_triangle_on_the_mount():
+    session, truth, start = adjust_scene.cell(
+        3, axes=("normal", "BC"), sigma_px=0.0, half_turns=6
+    )
+    tangents = np.zeros((len(session.stations), 6))
+    off = np.array([1e-4, -2e-4, 1e-4, 1e-4, 3e-4, -2e-4])
+    # A station of each mount.
+    tangents[[3, 20]] = off
+    reported = moved_robot(session, tangents)
+    # A robot that is believed far more than the pixels: the cell hardly moves.
+    strict = replace(reported, repeatability=adjust_scene.EXACT)
+    hidden = np.zeros(session.pixels.shape[:3], dtype=bool)
+    hidden[:, [3, 20]] = True
+    clean = adjust(adjust_scene.hide(strict, hidden), start)
+    assert clean.chi2 < 1e-12
+    result = adjust(strict, clean, loss=Loss("cauchy", 1e-3))
+    rigs = [truth.flange_from_triangle]
+    rigs += [mount.flange_from_triangle for mount in truth.other_mounts]
+    for j, rig in zip((3, 20), rigs, strict=True):
+        row = result.residuals[result.details["stations"].tolist().index(j)]
+        np.testing.assert_allclose(row, rig.inverse().adjoint() @ off, rtol=0.02)
+
+
+@pytest.mark.parametrize("loss", [Loss("huber", 2.5), Loss("cauchy", 2.5)])
+def test_wrong_detections_with_one_mount_do_not_spoil_the_other(loss):
+    session, _, start = adjust_scene.cell(
+        6, axes=("normal", "BC"), sigma_px=0.05, repeatability=adjust_scene.ROBOT
+    )
+    rng = np.random.default_rng(0)
+    wrong = rng.random(session.pixels.shape[:3]) < 0.08
+    wrong[:, (session.mounts == 0)] = False
+    wrong[:, session.indices("evaluation")] = False
+    pixels = session.pixels.copy()
+    pixels[wrong] += rng.uniform(3, 8, size=(wrong.sum(), 2))
+    spoiled = replace(session, pixels=pixels)
+    clean, plain, robust = (
+        evaluate_track(adjust(one, start, loss=how), session).rms
+        for one, how in ((session, None), (spoiled, None), (spoiled, loss))
+    )
+    assert robust < 1.3 * clean
+    assert robust < 0.5 * plain
