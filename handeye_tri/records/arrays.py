@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,19 +22,34 @@ def numeric(name: str, value: ArrayLike) -> Floats:
         value: Anything numpy reads as real numbers.
 
     Raises:
-        InputError: it is something else: text, lists of unequal length, complex.
+        InputError: it is something else: text, lists of unequal length, complex, or
+            True and False, alone or among numbers.
     """
     try:
         array = np.array(value)
-        if array.dtype.kind in "biuf":
-            return array.astype(float)
-        if array.dtype.kind != "O":
-            raise TypeError
-        return array.astype(float)
+        numbers = None if array.dtype.kind not in "biufO" else array.astype(float)
     except (TypeError, ValueError):
+        numbers = None
+    if numbers is None:
         raise InputError(
             f"{name} must be real numbers, in lists of equal length; got {shown(value)}"
-        ) from None
+        )
+    if _has_flags(value, array):
+        raise InputError(
+            f"{name} must be real numbers, not True and False; got {shown(value)}"
+        )
+    return numbers
+
+
+def _has_flags(value: ArrayLike, array: NDArray[Any]) -> bool:
+    """Whether there is a True or False in a value that numpy has read as an array."""
+    if array.dtype.kind == "b":
+        return True
+    if isinstance(value, np.ndarray) and array.dtype.kind != "O":
+        return False
+    # Lists of numbers and flags are read as numbers.
+    each = np.array(value, dtype=object).flat
+    return any(isinstance(one, (bool, np.bool_)) for one in each)
 
 
 def locked(

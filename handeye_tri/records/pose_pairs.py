@@ -72,7 +72,8 @@ class PosePairs:
             "camera_in_target" is its inverse.
         metric: Whether the observed translations are in metres; False for a target
             or a monocular map of unknown size.
-        names: What to call each observed pose; ("0", "1", ...) where empty.
+        names: What to call each observed pose, each another name; ("0", "1", ...)
+            where empty.
         robot_times: On the robot's clock, shape (n,), seconds; or None.
         observed_times: On the camera's clock, shape (m,), seconds; or None.
         noise: What is known of the noise; None estimates it from the residuals.
@@ -90,7 +91,7 @@ class PosePairs:
     noise: PoseNoise | None = None
 
     def __post_init__(self) -> None:
-        """Lock; raise InputError where words, counts or times do not fit."""
+        """Lock; raise InputError where words, names, counts or times do not fit."""
         for key, known in (
             ("mounting", Mounting),
             ("robot_direction", RobotDirection),
@@ -109,6 +110,13 @@ class PosePairs:
         names = tuple(self.names) or tuple(str(i) for i in range(m))
         if len(names) != m:
             raise InputError(f"{m} observed poses need as many names, got {len(names)}")
+        first: dict[str, int] = {}
+        for i, name in enumerate(names):
+            if first.setdefault(name, i) != i:
+                raise InputError(
+                    f"names must differ, and {name!r} is that of observed poses "
+                    f"{first[name]} and {i} (counted from 0)"
+                )
         object.__setattr__(self, "names", names)
         if (self.robot_times is None) != (self.observed_times is None):
             raise InputError(

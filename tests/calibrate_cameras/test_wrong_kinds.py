@@ -113,3 +113,27 @@ def test_a_number_known_of_the_camera_is_a_number() -> None:
 def test_what_is_no_session_is_named() -> None:
     with pytest.raises(InputError, match="session must be a Session, got 'cell'"):
         calibrate_session_cameras("cell")
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: calibrate_camera(
+            SCENE.before > 500, SCENE.after, TRIANGLE, image_size=IMAGE_SIZE
+        ),
+        lambda: one_camera(o=[True, False]),
+        lambda: one_camera(turn_covariance=np.eye(6, dtype=bool)),
+        lambda: calibrate_trials(
+            SCENE.before[None], SCENE.after[None] > 500, TRIANGLE, image_size=IMAGE_SIZE
+        ),
+        lambda: calibrate_cameras_general(
+            GENERAL > 500, TRIANGLE, image_sizes=IMAGE_SIZE
+        ),
+        lambda: calibrate_target_views(
+            GRID, np.ones((3, 4, 12, 2), dtype=bool), image_sizes=IMAGE_SIZE
+        ),
+    ],
+)
+def test_flags_are_no_coordinates(call: Any) -> None:
+    with pytest.raises(InputError, match="must be real numbers, not True and False"):
+        call()

@@ -26,6 +26,11 @@ def test_it_is_a_locked_copy_of_floats() -> None:
         (np.zeros(3), (None, 3), r"grid must have shape \(any, 3\), got \(3,\)"),
         ([0.0, np.nan], (2,), "grid must be finite"),
         ([0.0, np.inf], (2,), "grid must be finite"),
+        (np.array([True, False]), (2,), "grid must be real numbers, not True and Fa"),
+        ([1.5, True], (2,), "grid must be real numbers, not True and False"),
+        ([np.zeros(2), [0.5, np.True_]], (2, 2), "grid must be real numbers, not True"),
+        (np.array([1, True], dtype=object), (2,), "grid must be real numbers, not Tru"),
+        (["1", True], (2,), "grid must be real numbers, in lists"),
     ],
 )
 def test_what_is_refused(value: object, shape: tuple, message: str) -> None:  # type: ignore[type-arg]

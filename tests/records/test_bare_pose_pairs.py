@@ -50,6 +50,11 @@ def test_arrays_are_copied_and_locked():
         ),
         (
             (ROBOT, OBSERVED, *STATED),
+            {"names": ("a", "b", "c", "b")},
+            "names must differ, and 'b' is that of observed poses 1 and 3",
+        ),
+        (
+            (ROBOT, OBSERVED, *STATED),
             {"robot_times": [0, 1, 2, 3]},
             "robot's are there, the camera's absent",
         ),

@@ -146,6 +146,7 @@ MIRROR = np.diag([1.0, 1.0, -1.0]).tolist()
         (drop("pairs"), 'give either "pairs" or both'),
         (put(["robot"], []), 'give either "pairs" or both'),
         (put(["pairs"], []), "at least one item"),
+        (put(["pairs", 3, "name"], "p1"), "names must differ, and 'p1' is that of"),
         (lambda d: d["pairs"][2].pop("observed"), r"pairs\[2\] lacks 'observed'"),
         (
             lambda d: d["pairs"][1]["robot"].pop("translation_m"),
