@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handeye_tri.camera import INTRINSIC_NAMES
+from handeye_tri.config import CellToCalibrate
 from handeye_tri.counting import counted
 from handeye_tri.records import (
     GroundTruth,
@@ -91,20 +92,29 @@ def summary_text(
     return "\n".join(lines)
 
 
-def plan_text(plan: Plan, cell: str) -> str:
+def plan_text(plan: Plan, cell: CellToCalibrate) -> str:
     """What a programme promises, before the robot moves.
 
     Args:
         plan: The programme.
-        cell: Name of the cell.
+        cell: What it was planned for.
     """
     number = plan.certificate
     held_out = sum(station.kind == "evaluation" for station in plan.stations)
+    change = plan.tool_change
     lines = [
-        f"VERDICT  {plan.outcome}      cell {cell}, before the robot moves",
+        f"VERDICT  {plan.outcome}      cell {cell.name}, before the robot moves",
         f"  {counted(len(plan.half_turns), 'half-turn')}, "
         f"{counted(len(plan.stations) - held_out, 'station')} + {held_out} held out; "
         f"{number['cycle_time_s']:.1f} s of moves",
+        *(
+            [
+                f"  Tool change before station {change.before}, to "
+                f"{cell.mount_name(plan.stations[change.before].mount)}"
+            ]
+            if change is not None
+            else []
+        ),
         f"  Track error over the workspace box: {number['track_predicted_rms_mm']:.3f} "
         "mm rms expected,",
         f"  of which {number['track_calibration_rms_mm']:.3f} from the calibration"

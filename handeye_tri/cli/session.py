@@ -145,7 +145,7 @@ def plan(
         data = storage.read_json(finished.folder.file("plan.json"), PLAN_SCHEMA)
         click.echo(json.dumps(data, indent=1, ensure_ascii=False))
     else:
-        click.echo(plan_text(made, finished.cell.name))
+        click.echo(plan_text(made, finished.cell))
     if finished.is_designed and finished.has_robot:
         path, missing = write_plan_recording(finished)
         click.echo(f"wrote {path}: handeye-tri replay {session} --plan", err=True)
@@ -170,7 +170,7 @@ def _plan_more(session: Path, more: int) -> None:
             made, path = plan_more(run, more)
     finally:
         progress.close()
-    click.echo(plan_text(made, run.cell.name))
+    click.echo(plan_text(made, run.cell))
     click.echo(f"\nWROTE  {path}  {counted(len(made.stations), 'station')}")
     sys.exit(EXIT_CODES[made.outcome])
 

@@ -69,7 +69,7 @@ def write_plan_recording(run: Run) -> tuple[Path, str]:
         mechanism=run.mechanism,
         base_from_world=arm.base_from_world,
         motion=motion,
-        certificate=plan_text(plan, cell.name),
+        certificate=plan_text(plan, cell),
         views=views,
     )
     return path, missing

@@ -24,6 +24,7 @@ from handeye_tri.pipeline import (
 from handeye_tri.pipeline.execution import inputs_of
 from handeye_tri.replay.recording import read_numbers
 from handeye_tri.storage import SessionFolder
+from handeye_tri.summary import plan_text
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +64,8 @@ def test_it_passes_with_half_turns_on_both_mounts(run):
     assert set(made) == {(0, "normal"), (1, "BC")}
     assert len(made) == 6
     assert np.isfinite(session.pixels).all()
+    change = f"Tool change before station {plan.tool_change.before}, to mount 2 (about"
+    assert change in plan_text(plan, run.cell)
 
 
 def test_every_estimate_is_within_its_stated_sigma_of_the_truth(run):
