@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from handeye_tri.records import HandEyeCalibration, Session
+from handeye_tri.report.labels import place_names
 from handeye_tri.report.style import ESTIMATE, INK, RULE, WIDTH, svg
 
 Floats = NDArray[np.float64]
@@ -156,7 +158,8 @@ def frames(session: Session, calibration: HandEyeCalibration) -> str:
                 color="#999999",
                 linewidth=0.7,
             )
-        for (name, _), start, ends in zip(places, starts, tips, strict=True):
+        letters: list[Text] = []
+        for start, ends in zip(starts, tips, strict=True):
             for k, end in enumerate(ends):
                 colour = _AXIS_COLOURS[k]
                 along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
@@ -172,31 +175,26 @@ def frames(session: Session, calibration: HandEyeCalibration) -> str:
                         "shrinkB": 0,
                     },
                 )
-                ax.annotate(
-                    "xyz"[k],
-                    (end[0], end[1]),
-                    xytext=(5 * along[0], 5 * along[1]),
-                    textcoords="offset points",
-                    color=colour,
-                    fontsize=7,
-                    ha="center",
-                    va="center",
+                letters.append(
+                    ax.annotate(
+                        "xyz"[k],
+                        (end[0], end[1]),
+                        xytext=(5 * along[0], 5 * along[1]),
+                        textcoords="offset points",
+                        color=colour,
+                        fontsize=7,
+                        ha="center",
+                        va="center",
+                    )
                 )
-            # The name goes where no axis does.
-            away = start - ends.mean(axis=0)
-            away = 12 * away / max(float(np.linalg.norm(away)), 1e-9)
-            ax.annotate(
-                name,
-                (start[0], start[1]),
-                xytext=(away[0], away[1]),
-                textcoords="offset points",
-                ha="right" if away[0] < -4 else "left" if away[0] > 4 else "center",
-                va="top" if away[1] < -4 else "bottom" if away[1] > 4 else "center",
-            )
         ax.plot(*tips.reshape(-1, 2).T, alpha=0)
         ax.set_aspect("equal")
         ax.margins(0.14)
         ax.set_axis_off()
+        arrows = [(a, b) for a, ends in zip(starts, tips, strict=True) for b in ends]
+        sights = [(starts[0], starts[k]) for k in range(cameras, len(places))]
+        names = [name for name, _ in places]
+        place_names(ax, names, starts, letters, np.array(arrows + sights))
 
     height = float(np.clip(WIDTH * extent[1] / extent[0], 1.2, 3.8)) + 0.3
     return svg("frames", draw, height)
