@@ -310,6 +310,8 @@ def _minimise(
             growth = 2.0
             equations = blocks.equations()
         else:
+            # Residuals that are rounded leave the cost no finer than this.
+            negligible = bool(negligible or gain <= 2.0 * np.sqrt(cost) * rounding)
             damping, growth, before = damping * growth, 2 * growth, 0.0
         # A strongly damped step is short for that reason alone.
         if negligible and damping < 1.0:

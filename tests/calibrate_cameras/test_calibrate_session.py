@@ -99,6 +99,18 @@ def test_exact_half_turns_of_both_mounts(axes, count):
         assert one.chi2 < 1e-10
 
 
+@pytest.mark.parametrize("seed", range(3, 9))
+def test_exact_spheres_on_both_mounts_settle(seed):
+    # What is left of the eccentricity weighs far more than rounding and cannot go.
+    geometry = two_feet(seed, axes=("normal", "BC"), half_turns=12)
+    session, truth = observe(
+        geometry, sigma_px=0.0, robot=None, marker_radii=(0.008,) * 3
+    )
+    result = calibrate_session_cameras(session)
+    sigma = 0.015 * np.sqrt(np.diagonal(result.covariance.matrix))
+    np.testing.assert_allclose(errors(result, truth) / sigma, 0, atol=0.01)
+
+
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("axes", BOTH[:2])
 def test_noisy_half_turns_of_both_mounts_are_as_good_as_they_say(axes, count):
