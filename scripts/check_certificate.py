@@ -46,9 +46,10 @@ LOW, HIGH = 0.90, 1.10
 def check(name: str, runs: int) -> list[str]:
     """Prints a cell's ratios; returns what is outside its gate."""
     cell = read_cell(REPO / "scenes" / f"{name}.yaml")
-    arm = Arm(compile_mechanism(cell, REPO / "robot_models" / cell.arm.model))
-    plan = plan_motions(cell, arm, seed=1)
-    model = predictions(cell, arm)
+    path = REPO / "robot_models" / cell.arm.model
+    arms = [Arm(compile_mechanism(mounted, path)) for mounted in cell.mounted]
+    plan = plan_motions(cell, arms, seed=1)
+    model = predictions(cell, arms[0])
     started = time.perf_counter()
     errors = []
     for run in range(runs):

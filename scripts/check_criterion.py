@@ -59,16 +59,17 @@ def check(name, sigma_px, runs, draws):
     whole = read_cell(REPO / "scenes" / f"{name}.yaml").model_dump(by_alias=True)
     whole["plan"]["expected_sigma_px"] = sigma_px
     cell = parse_cell(whole, name)
-    arm = Arm(compile_mechanism(cell, REPO / "robot_models" / cell.arm.model))
-    model = predictions(cell, arm)
-    random = RandomPlans.of(cell, arm, model)
+    path = REPO / "robot_models" / cell.arm.model
+    arms = [Arm(compile_mechanism(mounted, path)) for mounted in cell.mounted]
+    model = predictions(cell, arms[0])
+    random = RandomPlans.of(arms, model)
     problems, medians, planned = [], {}, {}
     for half_turns, most in OVER_BOUND.items():
         rng = np.random.default_rng([2, half_turns])
         drawn = [random.draw(rng, half_turns) for _ in range(draws)]
         expected = np.array([random.track_mm(chosen) for chosen in drawn])
         median = medians[half_turns] = float(np.median(expected))
-        plan = plan_motions(cell, arm, 1, half_turns)
+        plan = plan_motions(cell, arms, 1, half_turns)
         track = planned[half_turns] = plan.certificate["track_calibration_rms_mm"]
         over_bound = track / plan.certificate["relaxed_bound_mm"]
         mine, theirs = [], []

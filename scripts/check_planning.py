@@ -12,8 +12,10 @@ stations, moves straight and looked at by nobody. "/order" is an arm that is tol
 stations' poses one after the other: at each it takes, of the solutions that pass every
 check of a plan, the one nearest to where it stands, as the sampler of a plan does
 (``CandidateSearch.free``). "/joints" goes by the very joints that the plan chose, which
-only its own order made worth choosing; it has no gate. Every plan is driven in MuJoCo,
-looked at every millisecond: "touch" counts those at which solids touch.
+only its own order made worth choosing; it has no gate. Of a cell with two mounts the
+stations with each are in random order, and the arm goes home for the tool change as in
+the plan. Every plan is driven in MuJoCo, looked at every millisecond: "touch" counts
+those at which solids touch.
 
 Seconds of planning are of one core at work, so that other work on the machine does
 not count. Exits with 1 where a plan fails, takes more than 15 s, touches, or takes
@@ -71,61 +73,75 @@ class Outcome:
     refused: str = ""
 
 
-def scene(name: str, model: Path) -> tuple[Cell, Arm]:
+def scene(name: str, model: Path) -> tuple[Cell, list[Arm]]:
+    """A cell, and the arm with each of its mounts."""
     cell = read_cell(REPO / "scenes" / f"{CELLS.get(name, name)}.yaml")
-    return cell, Arm(compile_mechanism(cell, model))
+    return cell, [Arm(compile_mechanism(one, model)) for one in cell.mounted]
 
 
 def outcome(name: str, model: Path, seed: int, half_turns: int) -> Outcome:
-    cell, arm = scene(name, model)
+    cell, arms = scene(name, model)
     start = time.process_time()
     try:
-        plan = plan_motions(cell, arm, seed, half_turns)
+        plan = plan_motions(cell, arms, seed, half_turns)
     except NoPlanError as error:
         return Outcome(np.nan, 0, {}, np.nan, np.nan, f"{name}, seed {seed}: {error}")
     seconds = time.process_time() - start
     cycle = plan.certificate["cycle_time_s"]
-    by_order = random_order_time(cell, arm, solutions_of(cell, arm, plan))
-    by_joints = random_order_time(cell, arm, [s.joints[None] for s in plan.stations])
+    by_order = random_order_time(cell, arms, plan, solutions_of(cell, arms, plan))
+    own = [s.joints[None] for s in plan.stations]
+    by_joints = random_order_time(cell, arms, plan, own)
     return Outcome(
         seconds,
-        contacts(cell, model, arm, plan)[0],
+        contacts(cell, model, arms[0], plan)[0],
         dict(plan.certificate),
         cycle / by_order,
         cycle / by_joints,
     )
 
 
-def solutions_of(cell: Cell, arm: Arm, plan: Plan) -> list[NDArray[np.float64]]:
+def solutions_of(
+    cell: Cell, arms: Sequence[Arm], plan: Plan
+) -> list[NDArray[np.float64]]:
     """Joints by which each station may be visited, shapes (k, q)."""
     rng = np.random.default_rng(0)
-    view = View(cell)
-    search = CandidateSearch(view, arm, rng)
+    views = [View(mounted) for mounted in cell.mounted]
+    searches = [
+        CandidateSearch(view, arm, rng) for view, arm in zip(views, arms, strict=True)
+    ]
     poses = np.array([station.base_from_flange.matrix for station in plan.stations])
-    seen = view.seen(arm.base_from_world.inverse().matrix @ poses)
+    world = arms[0].base_from_world.inverse().matrix @ poses
     found = []
-    solved = arm.inverse(poses, rng).joints
+    solved = arms[0].inverse(poses, rng).joints
     for k, station in enumerate(plan.stations):
         # Near its limits an arm of seven joints may be hard to solve anew.
         joints = solved[k] if len(solved[k]) else station.joints[None]
-        free = search.free(
-            Prospect(poses[k, None], seen[k], joints[:, None]), len(joints)
+        seen = views[station.mount].seen(world[[k]])[0]
+        free = searches[station.mount].free(
+            Prospect(poses[k, None], seen, joints[:, None]), len(joints)
         )
         found.append(np.array([candidate.joints[0] for candidate in free]))
     return found
 
 
 def random_order_time(
-    cell: Cell, arm: Arm, solutions: Sequence[NDArray[np.float64]]
+    cell: Cell,
+    arms: Sequence[Arm],
+    plan: Plan,
+    solutions: Sequence[NDArray[np.float64]],
 ) -> float:
     """Mean seconds of all moves in a random order, each to the nearest solution."""
-    rng = np.random.default_rng(0)
+    rng, arm = np.random.default_rng(0), arms[0]
     times = []
     for _ in range(100):
         route = [arm.home]
-        for k in rng.permutation(len(solutions)):
-            gaps = np.linalg.norm(solutions[k] - route[-1], axis=1)
-            route.append(solutions[k][gaps.argmin()])
+        for mount in range(len(arms)):
+            if mount > 0:
+                route.append(arm.home)
+            own = [s.index for s in plan.stations if s.mount == mount]
+            for k in rng.permutation(own):
+                gaps = np.linalg.norm(solutions[k] - route[-1], axis=1)
+                route.append(solutions[k][gaps.argmin()])
         moves = travel_time(
             np.array(route[:-1]),
             np.array(route[1:]),
@@ -168,7 +184,7 @@ def check(
         model = REPO / "robot_models" / "hp3_like.xml"
         if name == SEVEN:
             model = seven_joints(Path(folder))
-        cell, arm = scene(name, model)
+        cell, arms = scene(name, model)
         every = joblib.Parallel(n_jobs=jobs)(
             joblib.delayed(outcome)(name, model, seed, half_turns)
             for seed in range(1, seeds + 1)
@@ -185,7 +201,7 @@ def check(
     cycle = np.array([c["cycle_time_s"] for c in numbers])
     of_order = max(one.of_order for one in plans)
     of_joints = max(one.of_joints for one in plans)
-    random = RandomPlans.of(cell, arm, predictions(cell, arm))
+    random = RandomPlans.of(arms, predictions(cell, arms[0]))
     rng = np.random.default_rng(2)
     drawn = [random.draw(rng, half_turns) for _ in range(random_plans)]
     usual = np.median([random.track_mm(chosen) for chosen in drawn])

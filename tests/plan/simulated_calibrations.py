@@ -24,6 +24,7 @@ from handeye_tri.records import (
     Repeatability,
     Session,
     Station,
+    triangle_name,
 )
 from handeye_tri.se3 import SE3
 from handeye_tri.synthesize import Geometry, synthesize
@@ -83,6 +84,7 @@ def from_truth(session: Session, truth: GroundTruth) -> HandEyeCalibration:
         1,
         np.zeros((1, 6)),
         "the truth",
+        other_mounts=truth.other_mounts,
     )
     return adjust(session, start)
 
@@ -146,10 +148,10 @@ def squared_errors(
             found.cameras, found.base_from_camera, truth.base_from_camera, strict=True
         )
     }
-    motions["flange_from_triangle"] = [
-        found.flange_from_triangle,
-        truth.flange_from_triangle,
-    ]
+    mounts = [truth.flange_from_triangle]
+    mounts += [mount.flange_from_triangle for mount in truth.other_mounts]
+    for k, (mine, true) in enumerate(zip(found.mounts, mounts, strict=True)):
+        motions[triangle_name(k)] = [mine.flange_from_triangle, true]
     for name, (mine, true) in motions.items():
         off = (mine.inverse() @ true).log()
         errors[f"sigma.{name}.translation_mm"] = 1e6 * off[:3] @ off[:3]
@@ -195,7 +197,7 @@ def block_of(name: str) -> str:
     owner = name.removeprefix("sigma.").split(".")[0]
     if owner.startswith("base_from_") or owner == "baseline_mm":
         return "places"
-    return "rig" if owner == "flange_from_triangle" else "intrinsics"
+    return "rig" if owner.startswith("flange_from_triangle") else "intrinsics"
 
 
 def by_quantity(

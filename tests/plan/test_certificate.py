@@ -261,6 +261,30 @@ def test_baseline_sigma_is_that_of_drawn_cameras():
     assert model.baseline_sigma(covariance) == pytest.approx(lengths.std(), rel=0.05)
 
 
+@pytest.mark.parametrize("name", ["hp3_stereo", "hp3_stereo_both"])
+def test_predicted_covariance_is_that_of_the_joint_adjustment(name):
+    """One calibration, its noise small beside the curvature of the model."""
+    cell, model, plan = scene.cell_of(name), model_of(name), scene.plan_of(name)
+    stations, half_turns = simulated.to_calibrate(plan)
+    rng = np.random.default_rng(8)
+    session, truth = simulated.simulated(cell, model, stations, half_turns, rng)
+    stated = simulated.from_truth(session, truth).covariance
+    predicted = model.covariance(
+        model.of_stations(
+            np.array([s.base_from_flange.matrix for s in stations]),
+            np.ones((len(stations), 2), dtype=bool),
+            np.array([s.mount for s in stations]),
+        ).sum(axis=0)
+    )
+    found = stated.block(model.labels)
+    scale = np.sqrt(np.diag(predicted.matrix))
+    np.testing.assert_allclose(
+        found / np.outer(scale, scale),
+        predicted.matrix / np.outer(scale, scale),
+        atol=0.02,
+    )
+
+
 def test_predicted_sigmas_are_those_of_simulated_adjustments():
     """60 runs know a sigma to 9 %; a block's pool to 3 to 6 %."""
     cell, model = scene.cell_of("hp3_stereo"), model_of()
