@@ -149,19 +149,25 @@ def start(
             "half_turns": cell.plan.half_turns if half_turns is None else half_turns,
             "method": METHODS[0],
             "simulated": True,
-            "stations_rad_or_m": stations and _stations(stations, cell, model),
+            **(_stations(stations, cell, model) if stations else _NO_STATIONS),
             "stages": {},
         },
     )
 
 
-def _stations(path: Path, cell: Cell, model: Path) -> list[list[float]]:
+_NO_STATIONS = {"stations_rad_or_m": None, "station_mounts": None}
+
+
+def _stations(path: Path, cell: Cell, model: Path) -> dict[str, Any]:
+    """Joints and mounts of a user's own stations."""
     from handeye_tri.arm import Arm
     from handeye_tri.simulate import compile_mechanism
 
     arm = Arm(compile_mechanism(cell, model))
-    joints = storage.read_joint_list(path, arm.joint_names, arm.slides)
-    return [[float(value) for value in row] for row in joints]
+    joints, mounts = storage.read_joint_list(
+        path, arm.joint_names, arm.slides, len(cell.mounted)
+    )
+    return {"stations_rad_or_m": joints.tolist(), "station_mounts": mounts.tolist()}
 
 
 class Run:

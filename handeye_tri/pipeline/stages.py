@@ -32,7 +32,8 @@ def _plan(run: Run) -> tuple[list[str], str]:
 
     stations = run.folder.header.get("stations_rad_or_m")
     if stations:
-        plan = certify_stations(run.designed_cell, run.arm, stations)
+        mounts = run.folder.header.get("station_mounts")
+        plan = certify_stations(run.designed_cell, run.arms, stations, mounts)
     else:
         plan = plan_motions(
             run.designed_cell,
@@ -265,7 +266,7 @@ STAGES = {
             ("arm", *_HELD, "cameras", "surroundings", "plan"),
             (),
             _plan,
-            ("stations_rad_or_m",),
+            ("stations_rad_or_m", "station_mounts"),
         ),
         Stage(
             "simulate",

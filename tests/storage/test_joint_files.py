@@ -20,7 +20,8 @@ def written(tmp_path, text):
 
 
 def test_units_and_columns_are_taken_by_name(tmp_path):
-    joints = read_joint_list(written(tmp_path, GOOD), NAMES, SLIDES)
+    joints, mounts = read_joint_list(written(tmp_path, GOOD), NAMES, SLIDES)
+    assert not mounts.any()
     np.testing.assert_allclose(
         joints, [[np.pi / 2, 0.5, 0.25], [-np.pi / 2, -0.5, 0.0]]
     )
@@ -31,7 +32,51 @@ def test_what_is_written_is_read_again(tmp_path):
     path = tmp_path / "out.csv"
     write_joint_list(path, NAMES, SLIDES, joints)
     assert path.read_text().splitlines()[0] == "s_deg,l_deg,rail_mm"
-    np.testing.assert_allclose(read_joint_list(path, NAMES, SLIDES), joints, rtol=1e-14)
+    read, _ = read_joint_list(path, NAMES, SLIDES)
+    np.testing.assert_allclose(read, joints, rtol=1e-14)
+
+
+def test_mounts_that_are_written_are_read_again(tmp_path):
+    joints = np.random.default_rng(0).normal(size=(4, 3))
+    path = tmp_path / "out.csv"
+    write_joint_list(path, NAMES, SLIDES, joints, np.array([1, 1, 0, 0]))
+    lines = path.read_text().splitlines()
+    assert [line.rsplit(",", 1)[1] for line in lines] == ["mount", *"2211"]
+    read, mounts = read_joint_list(path, NAMES, SLIDES, 2)
+    np.testing.assert_allclose(read, joints, rtol=1e-14)
+    assert mounts.tolist() == [1, 1, 0, 0]
+
+
+def with_mounts(*values):
+    lines = ["s_deg,l_deg,rail_m,mount", *(f"1,2,3,{value}" for value in values)]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "mounts", "message"),
+    [
+        (GOOD, 2, "line 1 must have one column mount, since the cell has 2 mounts"),
+        (with_mounts(1, 2), 1, "line 3, mount: '2' is none of the cell's mounts; it "),
+        (with_mounts(1, 3), 2, "line 3, mount: '3' is none of"),
+        (with_mounts(0, 1), 2, "line 2, mount: '0' is none of"),
+        (with_mounts(1, ""), 2, "line 3, mount: '' is none of"),
+        (with_mounts(1, 2, 1), 2, "the mount changes in lines 3, 4, but a programme"),
+        (
+            "s_deg,l_deg,rail_m,mount,mount\n1,2,3,1,1\n",
+            1,
+            "line 1 must have one column mount, since the cell has 1 mount",
+        ),
+    ],
+)
+def test_wrong_mounts_are_refused_by_line(tmp_path, text, mounts, message):
+    with pytest.raises(InputError, match="stations.csv") as caught:
+        read_joint_list(written(tmp_path, text), NAMES, SLIDES, mounts)
+    assert message in str(caught.value)
+
+
+def test_a_cell_with_one_mount_may_say_so(tmp_path):
+    path = written(tmp_path, with_mounts(1, 1))
+    assert read_joint_list(path, NAMES, SLIDES)[1].tolist() == [0, 0]
 
 
 @pytest.mark.parametrize(
@@ -61,7 +106,7 @@ def test_wrong_files_are_refused_by_line_and_column(tmp_path, text, message):
 def test_any_bytes_end_in_numbers_or_a_sentence(tmp_path_factory, data):
     path = written(tmp_path_factory.mktemp("fuzz"), data)
     try:
-        joints = read_joint_list(path, NAMES, SLIDES)
+        joints, _ = read_joint_list(path, NAMES, SLIDES)
     except HandEyeError as error:
         said = str(error)
     else:
