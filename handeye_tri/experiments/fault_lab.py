@@ -43,11 +43,13 @@ class Fault:
         name: What it is called; one of INJECTIONS.
         code: The finding that must be named first.
         ranges: What is drawn, by its name with its unit.
+        mounts: With how many mounts a cell can have it.
     """
 
     name: str
     code: str
     ranges: Mapping[str, tuple[float, float]]
+    mounts: tuple[int, ...] = (1, 2)
 
 
 def read_faults(path: Path) -> tuple[str, tuple[Fault, ...]]:
@@ -74,6 +76,7 @@ def read_faults(path: Path) -> tuple[str, tuple[Fault, ...]]:
                 key: (float(ends[0]), float(ends[1]))
                 for key, ends in entry["ranges"].items()
             },
+            tuple(entry.get("mounts", (1, 2))),
         )
         for name, entry in data["faults"].items()
         for ranges in (entry["ranges"],)
@@ -86,10 +89,10 @@ def rendered_cell(cell_name: str, seed: int) -> RenderedCell:
     path = storage.find_cell(cell_name)
     cell = storage.read_cell(path)
     model_path = storage.find_model(cell, path)
-    arm = Arm(compile_mechanism(cell, model_path))
-    plan = plan_motions(cell, arm, seed, half_turns=cell.plan.half_turns)
-    joints = simulate.execute(arm, plan, cell.repeatability, seed)
-    rendered = RenderedCell(cell, model_path, arm, plan, joints, seed)
+    arms = [Arm(compile_mechanism(one, model_path)) for one in cell.mounted]
+    plan = plan_motions(cell, arms, seed, half_turns=cell.plan.half_turns)
+    joints = simulate.execute(arms[0], plan, cell.repeatability, seed)
+    rendered = RenderedCell(cell, model_path, arms[0], plan, joints, seed)
     rendered.photograph()
     return rendered
 
@@ -148,11 +151,14 @@ def trial(seed: int, cell_name: str, faults: Sequence[Fault]) -> dict[str, Any]:
     """One seed: the healthy cell, and the same cell with each fault.
 
     Returns:
-        What :func:`judged` says, by the fault's name; "healthy" for none.
+        What :func:`judged` says, by the fault's name; "healthy" for none. Faults
+        that the cell cannot have are left out.
     """
     cell = rendered_cell(cell_name, seed)
     found = {"healthy": judged(cell, cell.observed())}
     for fault in faults:
+        if len(cell.cell.mounted) not in fault.mounts:
+            continue
         rng = np.random.default_rng(
             [seed, _FAULT_STREAM, list(INJECTIONS).index(fault.name)]
         )

@@ -6,13 +6,13 @@ images show, or what is stated about them. Nothing that estimates or judges is t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from handeye_tri.experiments.rendered_cell import Image, Observed, RenderedCell, View
-from handeye_tri.records import Floats
+from handeye_tri.records import Floats, Station
 from handeye_tri.se3 import SE3, se3_exp, se3_inverse, se3_log
 from handeye_tri.triangle import TriangleRig
 
@@ -32,18 +32,18 @@ def _direction(rng: np.random.Generator, length: float, count: int = 3) -> Float
 
 
 def _step_station(
-    healthy: RenderedCell, ranges: Ranges, rng: np.random.Generator
+    stations: Sequence[Station], ranges: Ranges, rng: np.random.Generator
 ) -> int:
-    """Calibration station at which something moves."""
-    count = sum(station.kind == "calibration" for station in healthy.plan.stations)
-    return max(1, round(count * rng.uniform(*ranges["from_share"])))
+    """Station at which something moves, as far into these as so many calibrate."""
+    count = sum(station.kind == "calibration" for station in stations)
+    return stations[max(1, round(count * rng.uniform(*ranges["from_share"])))].index
 
 
 def camera_moved(
     healthy: RenderedCell, ranges: Ranges, rng: np.random.Generator
 ) -> Observed:
     """One camera stands elsewhere from some station on."""
-    station = _step_station(healthy, ranges, rng)
+    station = _step_station(healthy.plan.stations, ranges, rng)
     i = int(rng.integers(len(healthy.cell.cameras)))
     step = SE3.exp(
         np.r_[
@@ -74,9 +74,13 @@ def camera_moved(
 def rig_slipped(
     healthy: RenderedCell, ranges: Ranges, rng: np.random.Generator
 ) -> Observed:
-    """The rig slides and turns in its clamp at some station."""
-    station = _step_station(healthy, ranges, rng)
-    rig = healthy.cell.rig
+    """The rig slides and turns in its clamp, on one of its mounts, at some station."""
+    mounts, mounted = healthy.mounts, healthy.cell.mounted
+    mount = int(rng.integers(len(mounted))) if len(mounted) > 1 else 0
+    held = [one for one in healthy.plan.stations if one.mount == mount]
+    station = _step_station(held, ranges, rng)
+    alone = mounted[mount]
+    rig = alone.rig
     along, across, ahead = _direction(rng, rng.uniform(*ranges["moved_mm"]))
     turned = rng.choice([-1, 1]) * rng.uniform(*ranges["turned_deg"])
     foot = 1e3 * rig.triangle.circumcentre if rig.o_mm is None else np.array(rig.o_mm)
@@ -87,9 +91,14 @@ def rig_slipped(
             "o_mm": (float(foot[0] + along), float(foot[1] + across)),
         }
     )
-    cell = healthy.cell.model_copy(update={"rig": slipped})
-    views = [view for view in healthy.views if view[1] >= station]
-    return healthy.observed(healthy.rendered(cell, healthy.joints, views))
+    cell = alone.model_copy(update={"rig": slipped})
+    views = [
+        view
+        for view in healthy.views
+        if view[1] >= station and mounts[view[1]] == mount
+    ]
+    only = [0] * len(mounts)
+    return healthy.observed(healthy.rendered(cell, healthy.joints, views, only))
 
 
 def joint_offset(
@@ -182,8 +191,11 @@ def _ways(healthy: RenderedCell) -> list[Floats]:
     commanded = np.array([station.joints for station in healthy.plan.stations])
     ways = []
     for j in range(len(commanded) - 1):
-        passed = healthy.plan.via[j + 1]
-        ways.append((passed[0] if len(passed) else commanded[j + 1]) - commanded[j])
+        change = healthy.plan.tool_change
+        passed, there = healthy.plan.via[j + 1], commanded[j + 1]
+        if change is not None and change.before == j + 1:
+            passed, there = change.via, change.joints
+        ways.append((passed[0] if len(passed) else there) - commanded[j])
     return ways
 
 
@@ -219,24 +231,27 @@ def motion_blur(
     for j in rng.choice(np.arange(1, len(ways) + 1), count, replace=False):
         length = rng.uniform(*ranges["length_px"])
         back = -ways[j - 1]
-        share = length / _pixels_per_way(healthy, healthy.joints[j], back)
+        mount = healthy.mounts[j]
+        share = length / _pixels_per_way(healthy, mount, healthy.joints[j], back)
         exposures = int(np.ceil(_EXPOSURES_PER_PX * length)) + 1
         many = healthy.joints[j] + share * np.linspace(0, 1, exposures)[:, None] * back
         for i in range(len(healthy.cell.cameras)):
             views = [(i, k) for k in range(exposures)]
-            drawn = healthy.rendered(healthy.cell, many, views)
+            held = [mount] * exposures
+            drawn = healthy.rendered(healthy.cell, many, views, held)
             mean = np.mean([drawn[view].astype(float) for view in views], axis=0)
             changed[i, int(j)] = np.rint(mean).astype(np.uint8)
     return healthy.observed(changed)
 
 
-def _pixels_per_way(healthy: RenderedCell, joints: Floats, way: Floats) -> float:
+def _pixels_per_way(
+    healthy: RenderedCell, mount: int, joints: Floats, way: Floats
+) -> float:
     """By how much a whole way would move the markers in the images, on the mean, px."""
     small = 1e-4
     moved = []
-    points = healthy.cell.rig.flange_from_triangle.apply(
-        healthy.cell.rig.triangle.points
-    )
+    rig = healthy.cell.mounted[mount].rig
+    points = rig.flange_from_triangle.apply(rig.triangle.points)
     poses = healthy.arm.forward(np.stack([joints, joints + small * way]))
     for camera in healthy.cell.cameras:
         place = healthy.arm.base_from_world @ camera.world_from_camera
@@ -349,6 +364,28 @@ def pairs_shifted(
     return Observed(session, np.roll(observed.edges, way, axis=1))
 
 
+def tool_change_misstated(
+    healthy: RenderedCell, ranges: Ranges, rng: np.random.Generator
+) -> Observed:
+    """The tool change is stated some stations too early or too late.
+
+    A half-turn that would go on over it is not stated.
+    """
+    change = healthy.plan.tool_change
+    assert change is not None
+    by = int(rng.choice([-1, 1])) * int(rng.uniform(*ranges["stations"]))
+    stations = tuple(
+        replace(station, mount=int(station.index >= change.before + by))
+        for station in healthy.plan.stations
+    )
+    turns = tuple(
+        replace(turn, axis=healthy.cell.axes[stations[turn.before].mount])
+        for turn in healthy.plan.half_turns
+        if stations[turn.before].mount == stations[turn.after].mount
+    )
+    return healthy.observed(None, stations, turns)
+
+
 INJECTIONS: dict[
     str, Callable[[RenderedCell, Ranges, np.random.Generator], Observed]
 ] = {
@@ -368,5 +405,6 @@ INJECTIONS: dict[
         turn_not_180,
         poses_inverted,
         pairs_shifted,
+        tool_change_misstated,
     )
 }

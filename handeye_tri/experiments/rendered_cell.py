@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -39,7 +39,7 @@ class RenderedCell:
     Attributes:
         cell: Its description.
         model_path: The arm's model.
-        arm: Its kinematics.
+        arm: Its kinematics, whatever the mount.
         plan: What the robot is told.
         joints: Where it truly goes, (n, q), rad or m.
         seed: Of the sensor's noise.
@@ -73,8 +73,17 @@ class RenderedCell:
         )
         self.found = self._detected(blank, self.images)
 
+    @property
+    def mounts(self) -> list[int]:
+        """Which mount truly holds the triangle at each station, from 0."""
+        return [station.mount for station in self.plan.stations]
+
     def rendered(
-        self, cell: Cell, joints: Floats, views: Iterable[View]
+        self,
+        cell: Cell,
+        joints: Floats,
+        views: Iterable[View],
+        mounts: Sequence[int] | None = None,
     ) -> dict[View, Image]:
         """Images of some views of a cell whose truth may be another.
 
@@ -82,8 +91,12 @@ class RenderedCell:
             cell: The cell as it then is.
             joints: Where the robot then is at each station, shape (n, q), rad or m.
             views: Camera and station of each.
+            mounts: Of that cell, at each station; None: as planned.
         """
-        drawn = simulate.render_views(cell, self.model_path, joints, self.seed, views)
+        drawn = simulate.render_views(
+            *(cell, self.model_path, joints, self.seed, views),
+            mounts=self.mounts if mounts is None else mounts,
+        )
         return {(i, j): image for i, j, image in drawn}
 
     def observed(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from two_mount_cell import geometry, observed
 
 from handeye_tri import simulate, storage
 from handeye_tri.arm import Arm
@@ -11,6 +12,7 @@ from handeye_tri.experiments.fault_lab import judged, read_faults
 from handeye_tri.experiments.faulty_cell import INJECTIONS
 from handeye_tri.experiments.rendered_cell import RenderedCell
 from handeye_tri.plan import plan_motions
+from handeye_tri.records import Plan, ToolChange
 from handeye_tri.simulate import compile_mechanism
 
 FAULTS = storage.shipped("scenes") / "faults" / "faults.yaml"
@@ -66,6 +68,40 @@ def test_a_fault_of_no_size_changes_nothing(healthy, name, ranges):
     # A camera's place goes through eight digits of a description at least.
     assert np.nanmax(apart) < 1e-3
     assert len(whole.half_turns) == 5
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_misstated_tool_change_is_all_that_changes(seed):
+    true = geometry(1)
+    session = observed(true, 1)
+    change = ToolChange(15, np.zeros(6), np.zeros((0, 6)))
+    plan = Plan(
+        *(true.stations, true.half_turns, {}, {}, 1, "PASS", ()), tool_change=change
+    )
+    path = storage.find_cell("hp3_stereo_both")
+    cell = storage.read_cell(path)
+    model = storage.find_model(cell, path)
+    arm = Arm(compile_mechanism(cell.mounted[0], model))
+    edges = np.full((*session.pixels.shape[:3], 3), np.nan)
+    found = session.pixels, session.pixel_covariance, edges
+    rendered = RenderedCell(cell, model, arm, plan, np.zeros((30, 6)), 1, {}, found)
+    wrong = INJECTIONS["tool_change_misstated"](
+        rendered, {"stations": (3, 4)}, np.random.default_rng(seed)
+    ).session
+    np.testing.assert_array_equal(wrong.pixels, session.pixels)
+    (stated,) = np.flatnonzero(np.diff(wrong.mounts)) + 1
+    assert stated in (12, 18)
+    # Stations 17 and 18 make a half-turn; it is lost where it would be parted.
+    assert len(wrong.half_turns) == {12: 12, 18: 11}[stated]
+    for turn in wrong.half_turns:
+        assert turn.axis == ("BC" if turn.before >= stated else "normal")
+
+
+def test_faults_say_with_how_many_mounts_a_cell_can_have_them():
+    mounts = {one.name: one.mounts for one in read_faults(FAULTS)[1]}
+    assert mounts.pop("tool_change_misstated") == (2,)
+    assert mounts.pop("motion_insufficient") == (1,)
+    assert set(mounts.values()) == {(1, 2)}
 
 
 def test_a_moved_camera_sees_the_markers_where_it_should(healthy):
