@@ -119,9 +119,9 @@ def frames(session: Session, calibration: HandEyeCalibration) -> str:
         own = np.flatnonzero(mounts == k).tolist()
         j = next((j for j in held_out if j in own), own[0])
         pose = session.stations[j].base_from_flange @ mount.flange_from_triangle
-        name = f"triangle at station {j}"
-        if calibration.other_mounts:
-            name += f", mount {k + 1}"
+        # Short names: two triangles may be near to each other.
+        several = bool(calibration.other_mounts)
+        name = f"mount {k + 1}, station {j}" if several else f"triangle at station {j}"
         rigs.append((name, pose.matrix))
     cameras = 1 + len(rigs)
     places = [

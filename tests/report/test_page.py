@@ -333,8 +333,8 @@ def test_each_mount_has_its_numbers_and_its_stations():
         assert both.count(title) == 1
     assert both.count("<code>flange_from_triangle_2</code>") == 1
     assert "6 half-turns, 3 with mount 1 and 3 with mount 2 (stations" in both
-    assert "triangle at station 6, mount 1" in both
-    assert "triangle at station 14, mount 2" in both
+    assert "mount 1, station 6" in both
+    assert "mount 2, station 14" in both
     head = '<th class="n">mount</th>'
     assert (one.count(head), both.count(head)) == (0, 2)
     assert "Also estimated" not in both
