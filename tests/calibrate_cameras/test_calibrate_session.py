@@ -297,6 +297,17 @@ def test_a_bad_half_turn_is_named_and_does_no_harm(damage):
     assert calibrate_hand_eye(rest, result).chi2 > 0
 
 
+@pytest.mark.parametrize("damage", [swapped, moved_point, repeated])
+def test_a_bad_half_turn_of_the_second_mount_is_named(damage):
+    session, truth = observe(two_feet(half_turns=12), sigma_px=0.03)
+    pixels, turn = session.pixels.copy(), session.half_turns[9]
+    names, why = damage(pixels, truth, session, turn)
+    result = calibrate_session_cameras(replace(session, pixels=pixels))
+    (dropped,) = result.details["dropped"]
+    assert (dropped.camera, dropped.half_turn) == (names[0], 9)
+    assert re.search(why, dropped.why)
+
+
 def test_healthy_sessions_lose_nothing():
     for seed in range(6):
         axis = ("normal", "CA", "AB")[seed % 3]

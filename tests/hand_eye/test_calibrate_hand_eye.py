@@ -149,6 +149,14 @@ def test_one_axis_with_each_mount_is_enough_if_they_differ():
             calibrate_hand_eye(session, drawn_cameras(one))
 
 
+def test_one_half_turn_with_each_mount_leaves_two_answers():
+    rng = np.random.default_rng(0)
+    few = two_mount_geometry(rng, half_turns=1, evaluation_stations=0)
+    session, _ = synthesize(few, rng, sigma_px=0.0)
+    with pytest.raises(DegenerateMotionError, match="ambiguous"):
+        calibrate_hand_eye(session, drawn_cameras(few))
+
+
 @pytest.mark.parametrize(
     ("kept", "words"),
     [
