@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from half_turn_damage import (
@@ -42,7 +44,7 @@ def test_four_of_twenty_bad_are_named_and_do_no_harm(axis, damage) -> None:
         dropped = result.details["dropped"]
         assert sorted(dropped) == bad.tolist()
         for i, word in zip(bad, words, strict=True):
-            assert any(part in dropped[i] for part in word.split("|")), dropped[i]
+            assert re.search(word, dropped[i]), dropped[i]
         assert result.details["used"].tolist() == good.tolist()
         axes = [scene.axes[i] for i in good]
         best = calibrate(scene, before[good], after[good], axis=axes)
