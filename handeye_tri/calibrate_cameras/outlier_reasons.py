@@ -21,7 +21,6 @@ from handeye_tri.calibrate_cameras.known_camera import (
     Build,
     build_of,
     fit_poses,
-    joined,
     own_homography,
 )
 from handeye_tri.calibrate_cameras.outlier_tests import left_over
@@ -158,16 +157,13 @@ class _Account:
 def _fit(
     changed: HalfTurnData, build: Build, consensus: Consensus
 ) -> tuple[HalfTurnModel, State] | None:
-    """Half-turns before the agreed camera, as something changed; None: they do not fit.
-
-    All of them have the same pixels.
-    """
+    """One half-turn before the agreed camera, as something in it is changed."""
     row = np.zeros(1, dtype=np.intp)
-    found = own_homography(changed.take(row), consensus.state.o[0])
+    found = own_homography(changed, consensus.state.o[0])
     if found is None:
         return None
-    model = build(changed, np.zeros(len(changed), dtype=np.intp))
-    state = fit_poses(model, joined([found] * len(changed)), consensus.state)
+    model = build(changed, row)
+    state = fit_poses(model, found, consensus.state)
     return None if state is None else (model, state)
 
 
@@ -215,11 +211,11 @@ def _other_angles(
             + (f"; {', '.join(sorted(alike))} would do as well" if alike else ""),
             turn.square,
             5,
-            # Small errors are as likely as large ones: alike in each octave.
+            # Either way, and in each octave alike: small errors are likelier.
             2.0
-            * float(np.log(np.pi / _LEAST_OFF))
+            * float(np.log(np.pi / _LEAST_OFF) / np.sqrt(2.0 * np.pi))
             * max(off, _LEAST_OFF)
-            / (np.sqrt(2.0 * np.pi) * turn.sigma),
+            / turn.sigma,
         )
 
 

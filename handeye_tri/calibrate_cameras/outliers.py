@@ -141,7 +141,9 @@ def find_consensus(
             except DegenerateMotionError:
                 # The others alone determine no camera, so that they cannot judge.
                 return 0.0
-        return _gain(data.take(row), build_of(build, row), each[i], *judge)
+        return gain_of_another_turn(
+            data.take(row), build_of(build, row), each[i], *judge
+        )
 
     core = np.sort(sound[_trimmed(joined(each), basis, least)])
     kept = core
@@ -187,10 +189,18 @@ def find_consensus(
     return Consensus(kept, lost, state, spread, noise)
 
 
-def _gain(
+def gain_of_another_turn(
     data: HalfTurnData, build: Build, own: Homographies, state: State, spread: Floats
 ) -> float:
-    """By how much a turn by another angle explains a half-turn better, chi-square."""
+    """By how much a turn by another angle explains a half-turn better, chi-square.
+
+    Args:
+        data: That half-turn alone.
+        build: Makes the model of copies of it.
+        own: Its own homography, to start from.
+        state: Camera, lens and O of the others.
+        spread: Covariance of camera and O, shape (g, g).
+    """
     model = build(data, np.zeros(1, dtype=np.intp))
     fitted = fit_poses(model, own, state)
     if fitted is None:

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from half_turn_damage import SIGMA, turned_by_170
 from half_turn_scene import IMAGE_SIZE, half_turn, make_scene
+from scipy.stats import binom, chi2
 
 from handeye_tri.calibrate_cameras import calibrate_camera
 from handeye_tri.calibrate_cameras.half_turns import read_half_turns
 from handeye_tri.calibrate_cameras.intrinsic_choice import IntrinsicChoice
+from handeye_tri.calibrate_cameras.known_camera import own_homography
+from handeye_tri.calibrate_cameras.outlier_tests import TURN_FREEDOM
+from handeye_tri.calibrate_cameras.outliers import gain_of_another_turn
 from handeye_tri.calibrate_cameras.refine import HalfTurnModel, State
 from handeye_tri.calibrate_cameras.turn_angle import other_turns, turned
 
@@ -76,7 +80,32 @@ def test_the_angle_s_sigma_is_its_spread() -> None:
     assert np.mean(np.square(scores)) == pytest.approx(1.0, abs=0.9)
 
 
-def test_a_half_turn_of_the_twin_is_told_from_one() -> None:
+def test_what_another_turn_gains_by_chance_is_less_than_stated() -> None:
+    gains = []
+    for seed in range(5):
+        rng = np.random.default_rng([4, seed])
+        scene = make_scene(rng, 20, "BC")
+        data, state = read(scene, *scene.noisy(rng, SIGMA))
+        for i in range(20):
+            one = data.take([i])
+            gains.append(
+                gain_of_another_turn(
+                    one,
+                    build,
+                    own_homography(one, state.o[0]),
+                    state,
+                    np.zeros((5, 5)),
+                )
+            )
+    # What is stated is a bound: of 100 at most those of a chi-square, but for chance.
+    for level in (0.2, 0.05):
+        count = (np.array(gains) > chi2.isf(level, TURN_FREEDOM)).sum()
+        assert count <= binom.isf(1e-3, 100, level)
+    # Noise alone gains something, as the angle near 180 degrees is free.
+    assert np.median(gains) > 0.2
+
+
+def test_a_turn_seen_from_elsewhere_is_told_from_a_half_turn() -> None:
     """Its turn of 170 degrees leaves as little as half-turns do in 1 of 1000."""
     rng = np.random.default_rng([11, 14])
     scene = make_scene(rng, 20, "BC")
