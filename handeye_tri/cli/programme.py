@@ -47,8 +47,9 @@ def programme(
 ) -> None:
     """Write a session's plan as a programme that a robot can run.
 
-    FORMAT: csv (joints by station), json, joint_trajectory (ROS 2), urscript. With
-    --then, a normal rig and an edge rig, say, are driven in one programme.
+    FORMAT: csv (joints by station), json, joint_trajectory (ROS 2), urscript. A plan
+    with two mounts states its tool change. With --then, two different triangles are
+    driven in one programme.
     """
     from handeye_tri.pipeline import NullProgress, Run
     from handeye_tri.pipeline.programme import planned_outcome, write_programme
@@ -76,8 +77,7 @@ def programme(
         click.echo(f"VERDICT{whose}  {outcome} (expected, before the robot moves)")
     if written.change is not None:
         click.echo(
-            f"{written.change}; the robot waits for it in its home after "
-            f"{written.change.before} of {len(written.stops)} stations; "
+            f"{written.change.of_programme(len(written.stops))}; "
             f"{seconds_of_moves(written):.1f} s of moves"
         )
     click.echo(f"wrote {output}")

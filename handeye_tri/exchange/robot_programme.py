@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from handeye_tri.counting import counted
 from handeye_tri.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -21,14 +22,15 @@ _BLEND = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolChange:
-    """Where the robot waits until a person has mounted another rig.
+    """Where the robot waits until a person has put on another tool.
 
     Attributes:
-        before: Number of the first station with the new rig, at least 1.
+        before: Number of the first station with the new tool; 0: the robot carries
+            the old one where the programme starts.
         joints: Where the robot waits, shape (q,), rad or m.
         via: Joints passed on the way there from the station before, shape (k, q).
-        tools: What the rigs are called, the one taken off first.
-        mount: What is to be mounted, in a few words.
+        tools: What the tools are called, the one taken off first.
+        mount: What is to be put on, in a few words.
     """
 
     before: int
@@ -39,7 +41,14 @@ class ToolChange:
 
     def __str__(self) -> str:
         """What a person must do."""
-        return f"tool change: take off {self.tools[0]}, mount {self.mount}"
+        return f"tool change: take off {self.tools[0]}, put on {self.mount}"
+
+    def of_programme(self, stations: int) -> str:
+        """The same, and after how many of a programme's stations."""
+        return (
+            f"{self}; the robot waits for it in its home after {self.before} of "
+            f"{counted(stations, 'station')}"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +67,9 @@ class Programme:
         speed: Speed limits, shape (q,), rad/s or m/s.
         acceleration_time: From rest to full speed, seconds.
         dwell: How long the robot stands at a station, seconds.
-        change: Where the rig is exchanged; None: one rig throughout.
+        change: Where the tool is exchanged; None: one tool throughout.
+        mounts: Which mount holds the triangle, from 0, by station; None: the cell has
+            one.
     """
 
     head: tuple[str, ...]
@@ -72,6 +83,7 @@ class Programme:
     acceleration_time: float
     dwell: float
     change: ToolChange | None = None
+    mounts: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         """Raise InputError where the dwell time is none."""
@@ -95,11 +107,17 @@ class Programme:
         change = self.change
         if change is None or change.before != station:
             return None
-        start = self.stops[[station - 1]]
-        return np.concatenate([start, change.via, change.joints[None]])
+        start = self.stops[station - 1] if station else self.home
+        return np.concatenate([start[None], change.via, change.joints[None]])
+
+    @property
+    def straight(self) -> bool:
+        """Whether no way passes a point between two stops."""
+        ways = [*self.via, *([self.change.via] if self.change else [])]
+        return not any(len(points) for points in ways)
 
     def called(self, station: int) -> str:
-        """A station's number, by rig where there are two."""
+        """A station's number, by tool where there are two."""
         if self.change is None:
             return str(station)
         after = station >= self.change.before
@@ -110,8 +128,9 @@ class Programme:
 def programme_json(programme: Programme) -> str:
     """The stations with their joints by name, rad or m.
 
-    ``tool_change`` is there where the rig is exchanged, before the station that
-    ``before_station`` names by its index.
+    ``tool_change`` is there where the tool is exchanged, before the station that
+    ``before_station`` names by its index; ``mount`` of a station, from 1, where the
+    cell has two.
     """
     change = programme.change
     data = {
@@ -125,6 +144,7 @@ def programme_json(programme: Programme) -> str:
             {
                 "index": k,
                 "kind": kind,
+                **({"mount": programme.mounts[k] + 1} if programme.mounts else {}),
                 "via": programme.via[k].tolist(),
                 "joints": programme.stops[k].tolist(),
             }

@@ -18,7 +18,11 @@ from handeye_tri.exchange.robot_programme import (
 from handeye_tri.pipeline.execution import require
 from handeye_tri.pipeline.run import Run
 from handeye_tri.pipeline.stages import stages_of
-from handeye_tri.pipeline.tool_change import check_other_rig, with_tool_change
+from handeye_tri.pipeline.tool_change import (
+    change_of,
+    check_other_rig,
+    with_tool_change,
+)
 from handeye_tri.records import Floats, Plan
 
 # What each is for, in a few words.
@@ -87,8 +91,7 @@ def plan_more(run: Run, half_turns: int) -> tuple[Plan, Path]:
     )
     programme = _programme(run, plan, here, _DWELL)
     listed, whole = (run.folder.file(f"next.{kind}") for kind in ("csv", "json"))
-    straight = not any(len(points) for points in plan.via)
-    path, other = (listed, whole) if straight else (whole, listed)
+    path, other = (listed, whole) if programme.straight else (whole, listed)
     _write(programme, path.suffix[1:], path)
     # What was planned before is not left beside it.
     other.unlink(missing_ok=True)
@@ -138,12 +141,15 @@ def write_programme(
 def _programme(run: Run, plan: Plan, start: Floats, dwell: float) -> Programme:
     """A plan that begins at joints ``start``."""
     arm, cell = run.arm, run.designed_cell
+    change = change_of(plan, cell)
+    mounts = tuple(station.mount for station in plan.stations)
     outcome = f"verdict {plan.outcome}: " + ("; ".join(plan.findings) or "no finding")
     return Programme(
         head=(
             f"handeye-tri: {counted(len(plan.half_turns), 'half-turn')} of cell "
             f"{cell.name}, seed {plan.seed}",
             outcome,
+            *([change.of_programme(len(plan.stations))] if change else []),
             "Planned in the model of the cell: try it slowly, a hand on the stop.",
         ),
         joint_names=arm.joint_names,
@@ -155,24 +161,31 @@ def _programme(run: Run, plan: Plan, start: Floats, dwell: float) -> Programme:
         speed=arm.speed,
         acceleration_time=cell.arm.acceleration_time_s,
         dwell=dwell,
+        change=change,
+        mounts=mounts if len(cell.mounted) > 1 else None,
     )
 
 
 def _write(programme: Programme, layout: str, path: Path) -> None:
     """A programme in one of LAYOUTS."""
     if layout == "csv":
-        if programme.change is not None:
+        if programme.change is not None and programme.mounts is None:
             raise InputError(
                 "csv holds stations only, and this programme changes the tool; "
                 "choose json, joint_trajectory or urscript"
             )
-        if any(len(points) for points in programme.via):
+        if not programme.straight:
             raise InputError(
                 "csv holds stations only, and this plan passes points between them; "
                 "choose json, joint_trajectory or urscript"
             )
+        mounts = programme.mounts
         storage.write_joint_list(
-            path, programme.joint_names, programme.slides, programme.stops
+            path,
+            programme.joint_names,
+            programme.slides,
+            programme.stops,
+            None if mounts is None else np.array(mounts),
         )
         return
     writers = {

@@ -1,4 +1,4 @@
-"""Two sessions of one arm and its cameras, each with its rig, as one programme."""
+"""Programmes with a tool change: of one plan with two mounts, or of two sessions."""
 
 from __future__ import annotations
 
@@ -10,23 +10,46 @@ import numpy as np
 
 from handeye_tri import storage
 from handeye_tri.arm import Arm
-from handeye_tri.config import RigConfig
+from handeye_tri.config import Cell, RigConfig
 from handeye_tri.errors import InputError
 from handeye_tri.exchange.robot_programme import Programme, ToolChange
 from handeye_tri.pipeline.run import Run
 from handeye_tri.plan.sequence import travel_time
-from handeye_tri.records import Floats
+from handeye_tri.records import Floats, Plan
 
 # What may differ between the two cells: what they are called, the rig, what is planned.
 _MAY_DIFFER = ("name", "rig", "plan", "imaging")
+
+
+def change_of(plan: Plan, cell: Cell) -> ToolChange | None:
+    """The tool change of a plan, in words for a person."""
+    change = plan.tool_change
+    if change is None:
+        return None
+    new = plan.stations[change.before].mount
+    old = plan.stations[change.before - 1].mount if change.before else 1 - new
+    ahead = cell.mounted[new].rig.ahead_mm
+    return ToolChange(
+        before=change.before,
+        joints=change.joints,
+        via=change.via,
+        tools=(cell.mount_name(old), cell.mount_name(new)),
+        mount=f"{cell.mount_name(new)}, {ahead:g} mm ahead of the flange",
+    )
 
 
 def check_other_rig(run: Run, then: Run) -> None:
     """See that two sessions are of the same arm and cameras, with different rigs.
 
     Raises:
-        InputError: they are not; names what differs.
+        InputError: they are not, naming what differs; or one changes the tool itself.
     """
+    for one in (run, then):
+        if one.designed_cell.second_mount is not None:
+            raise InputError(
+                f"{one.folder.path}: its own plan changes the tool, between the mounts "
+                "of its cell, and a programme does so once; write it without --then"
+            )
     first, second = (
         r.designed_cell.model_dump(mode="json", by_alias=True) for r in (run, then)
     )
@@ -81,8 +104,7 @@ def with_tool_change(
         first,
         head=(
             *first.head[:-1],
-            f"{change}; the robot waits for it in its home after {change.before} of "
-            f"{len(first.stops) + len(second.stops)} stations",
+            change.of_programme(len(first.stops) + len(second.stops)),
             *second.head,
         ),
         stops=np.concatenate([first.stops, second.stops]),

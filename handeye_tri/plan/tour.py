@@ -221,9 +221,18 @@ class Tour:
             return found[index]
 
         shortening = Shortening(self._selector, self._pool, solutions)
+        trips = []
         for leg in legs:
             others = [[c.joints for c in one] for one in leg.held_out.taken]
-            trip = Trip(leg.side.mount, leg.side.route, others, leg.start, leg.end)
+            trips.append(
+                Trip(leg.side.mount, leg.side.route, others, leg.start, leg.end)
+            )
+        # None takes all that may be given: first a like part for each of them.
+        least = self._selector.cost(chosen)
+        for number, trip in enumerate(trips[:-1], 1):
+            part = (limit / least) ** (number / len(trips))
+            chosen = shortening.exchanged(chosen, trip, least * part)
+        for trip in reversed(trips):
             chosen = shortening.exchanged(chosen, trip, limit)
         return chosen
 

@@ -123,7 +123,7 @@ CHANGE = ToolChange(
     mount="the other rig (as described)",
 )
 CHANGED = replace(PROGRAMME, change=CHANGE)
-STATED = "tool change: take off the first rig, mount the other rig (as described)"
+STATED = "tool change: take off the first rig, put on the other rig (as described)"
 
 
 def changed_way():
@@ -172,3 +172,18 @@ def test_urscript_waits_for_a_person_at_the_tool_change():
     assert before.count("sleep(") == 3
     assert 'textmsg("station ", "2 of the first rig")' in before
     assert 'textmsg("station ", "0 of the other rig")' in after
+
+
+def test_a_tool_may_be_changed_before_the_first_station():
+    """The robot comes with the other tool, and goes where it waits first."""
+    begin = replace(PROGRAMME, change=replace(CHANGE, before=0))
+    way = begin.way_to_change(0)
+    np.testing.assert_array_equal(way[[0, -1]], [begin.home, CHANGE.joints])
+    np.testing.assert_array_equal(begin.leg(0)[0], CHANGE.joints)
+    assert "after 0 of 5 stations" in begin.change.of_programme(5)
+
+
+def test_mounts_are_counted_from_one():
+    data = json.loads(programme_json(replace(CHANGED, mounts=(0, 0, 0, 1, 1))))
+    assert [station["mount"] for station in data["stations"]] == [1, 1, 1, 2, 2]
+    assert "mount" not in json.loads(programme_json(CHANGED))["stations"][0]

@@ -1,4 +1,4 @@
-"""Two plans, each with its rig, as one programme with a tool change between them."""
+"""Programmes with a tool change: of one plan with two mounts, or of two plans."""
 
 import json
 from dataclasses import replace
@@ -122,3 +122,82 @@ def test_the_command_states_the_tool_change(runs, tmp_path, capsys):
     assert "VERDICT of hp3_stereo_edge  " in out
     assert "the robot waits for it in its home after 12 of 24 stations" in out
     assert target.read_text().count("popup(") == 1
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory):
+    """One session whose plan has two mounts."""
+    folder = tmp_path_factory.mktemp("both") / "out"
+    run = Run(start("hp3_stereo_both", folder, 1, 4), NullProgress())
+    execute(run, stages_of(run), ("plan",), again=False)
+    return run
+
+
+def test_a_plan_with_two_mounts_is_one_programme(both, tmp_path):
+    written = write_programme(both, "json", tmp_path / "p.json", 1.0)
+    plan, data = both.plan(), json.loads((tmp_path / "p.json").read_text())
+    change = data["tool_change"]
+    assert change["before_station"] == plan.tool_change.before
+    assert change["take_off"] == "mount 1 (about a normal)"
+    assert change["mount"] == "mount 2 (about its edge BC), 90 mm ahead of the flange"
+    assert [s["mount"] for s in data["stations"]] == [
+        s.mount + 1 for s in plan.stations
+    ]
+    stated = "tool change: take off mount 1 (about a normal), put on mount 2 (about "
+    assert any(line.startswith(stated) for line in data["notice"])
+    seconds = seconds_of_moves(written)
+    assert seconds == pytest.approx(plan.certificate["cycle_time_s"], rel=1e-12)
+
+
+def test_the_stations_with_two_mounts_are_judged_again_from_their_file(
+    both, tmp_path, capsys
+):
+    folder, listed = str(both.folder.path), tmp_path / "stations.csv"
+    with pytest.raises(SystemExit) as left:
+        cli.main(["programme", folder, "csv", "-o", str(listed)])
+    assert left.value.code == 0
+    assert "put on mount 2 (about its edge BC)" in capsys.readouterr().out
+    assert listed.read_text().splitlines()[0].endswith(",mount")
+    again = Run(
+        start("hp3_stereo_both", tmp_path / "again", 1, None, listed), NullProgress()
+    )
+    execute(again, stages_of(again), ("plan",), again=False)
+    first, second = both.plan(), again.plan()
+    assert second.tool_change.before == first.tool_change.before
+    assert len(second.half_turns) == len(first.half_turns)
+    assert second.certificate["cycle_time_s"] == pytest.approx(
+        first.certificate["cycle_time_s"], rel=1e-9
+    )
+
+
+def test_stations_without_their_mounts_are_refused(both, tmp_path, capsys):
+    listed = tmp_path / "stations.csv"
+    write_programme(both, "csv", listed, 1.0)
+    rows = [line.rsplit(",", 1)[0] for line in listed.read_text().splitlines()]
+    listed.write_text("\n".join(rows))
+    arguments = ["plan", str(tmp_path / "out"), "--cell", "hp3_stereo_both"]
+    with pytest.raises(SystemExit) as left:
+        cli.main([*arguments, "--certify", str(listed)])
+    assert left.value.code == 2
+    assert "must have one column mount, since the cell has" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("layout", ["joint_trajectory", "urscript"])
+def test_the_other_formats_wait_between_the_mounts(both, layout, tmp_path):
+    write_programme(both, layout, tmp_path / "p", 1.0)
+    text = (tmp_path / "p").read_text()
+    stated = "put on mount 2 (about its edge BC), 90 mm ahead of the flange"
+    if layout == "urscript":
+        _, after = text.split("popup(")
+        assert stated in after.splitlines()[0]
+        assert 'textmsg("station ", "0 of mount 2 (about its edge BC)")' in after
+    else:
+        _, after = text.split("---\n")
+        assert stated in after.splitlines()[0]
+
+
+def test_a_plan_that_changes_the_tool_is_driven_alone(both, runs, tmp_path):
+    for first, then in ((both, runs[0]), (runs[0], both)):
+        with pytest.raises(InputError, match="its own plan changes the tool, between"):
+            write_programme(first, "json", tmp_path / "p", 1.0, then=then)
