@@ -207,7 +207,7 @@ def _other_angles(
         alike -= {f"{_degrees(turn):.1f}"}
         sigma = np.degrees(np.sqrt(scale) * turn.sigma)
         yield _Account(
-            f"a turn of {_degrees(turn):.1f} +- {sigma:.1g} degrees, not 180"
+            f"a turn of {_degrees(turn):.1f} +- {max(sigma, 0.1):.1f} degrees, not 180"
             + (f"; {', '.join(sorted(alike))} would do as well" if alike else ""),
             turn.square,
             5,

@@ -37,7 +37,6 @@ from handeye_tri.calibrate_cameras.known_camera import (
 from handeye_tri.calibrate_cameras.least_squares import NormalEquations
 from handeye_tri.calibrate_cameras.outlier_tests import (
     CHANCE,
-    FALSE_DISCOVERIES,
     FREEDOM,
     TESTS,
     TURN_FREEDOM,
@@ -145,6 +144,14 @@ def find_consensus(
             data.take(row), build_of(build, row), each[i], *judge
         )
 
+    def bad(chance: Floats) -> NDArray[np.bool_]:
+        """Which of those with a plane are bad, by the lowest chance of their tests.
+
+        Of several tests the lowest chance is as many times as likely.
+        """
+        no_plane = np.zeros(n - len(sound))
+        return discovered(np.concatenate([TESTS * chance, no_plane]))[: len(sound)]
+
     core = np.sort(sound[_trimmed(joined(each), basis, least)])
     kept = core
     for _ in range(8):
@@ -164,18 +171,15 @@ def find_consensus(
             noise.chances(square, freedom),
             noise.chances(left.by_angle, np.ones(len(sound))),
         )
-        # What another turn gains is a part of what is left over: nothing to gain for
-        # most, and nothing to decide for those that are bad already.
+        # What another turn gains is a part of what is left over: it decides only on
+        # those that would be dropped if it were all of it, and are not without it.
         most = noise.chances(square, np.full(len(sound), TURN_FREEDOM))
-        bad = TESTS * chance <= FALSE_DISCOVERIES / n
-        for i in np.flatnonzero((TESTS * most <= FALSE_DISCOVERIES) & ~bad).tolist():
+        dropped = bad(chance)
+        for i in np.flatnonzero(bad(np.minimum(chance, most)) & ~dropped).tolist():
             gain = gained(i, kept, (state, spread))
             other = noise.chances(np.array(gain), np.array(TURN_FREEDOM))
             chance[i] = min(chance[i], float(other))
-        # Of several tests the lowest chance is as many times as likely.
-        chance = np.minimum(TESTS * chance, 1.0)
-        no_plane = np.zeros(n - len(sound))
-        dropped = discovered(np.concatenate([chance, no_plane]))[: len(sound)]
+        dropped = bad(chance)
         good = sound[~dropped]
         if len(good) < least:
             order = np.lexsort((square / freedom, -chance))
