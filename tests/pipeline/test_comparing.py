@@ -1,14 +1,18 @@
 """handeye-tri compare: one session of a cell against an older one."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from drawn_session import drawn_session, with_outcome
 
 from handeye_tri import cli, storage
-from handeye_tri.pipeline import STAGES
+from handeye_tri.pipeline import STAGES, NullProgress, Run
 from handeye_tri.pipeline.execution import inputs_of
-from handeye_tri.storage import find_cell, find_model, read_cell
+from handeye_tri.records import Mount
+from handeye_tri.se3 import SE3
+from handeye_tri.storage import codec, find_cell, find_model, read_cell
 
 
 def call(capsys, *arguments):
@@ -76,6 +80,58 @@ def test_a_pushed_camera_fails_and_is_named(capsys, tmp_path, moved_cell):
     changed = [line.split("  ")[1] for line in out.splitlines() if "CHANGED" in line]
     assert changed == ["left in base", "right to first camera"]
     assert "markers seen after" in out
+
+
+def slipped(run, mount, by):
+    """The session had the rig moved on a mount (from 1, m): its results say so."""
+    found = run.hand_eye()
+    mounts = list(found.mounts)
+    one = mounts[mount - 1]
+    way = SE3.from_parts(np.eye(3), np.array([by, 0.0, 0.0]))
+    frame = way @ one.flange_from_triangle
+    mounts[mount - 1] = Mount(frame, way.apply(one.markers))
+    changed = replace(
+        found,
+        flange_from_triangle=mounts[0].flange_from_triangle,
+        markers=mounts[0].markers,
+        other_mounts=tuple(mounts[1:]),
+    )
+    path = run.folder.file("hand_eye.json")
+    data = json.loads(path.read_text()) | codec.hand_eye_to_json(changed)
+    storage.write_json(path, data)
+    for name in ("hand_eye", "evaluate"):
+        line = run.folder.header["stages"][name]["line"]
+        outputs = list(run.folder.outputs(name))
+        run.folder.record(name, inputs_of(run, STAGES[name]), outputs, line)
+    return Run(storage.SessionFolder.open(run.folder.path), NullProgress())
+
+
+def test_mounts_are_compared_one_by_one(capsys, tmp_path):
+    cell = "hp3_stereo_both"
+    before = drawn_session(tmp_path, cell=cell, name="before")
+    after = drawn_session(tmp_path, cell=cell, seed=4, name="after")
+    code, out, _ = call(capsys, "compare", *folders(before, after))
+    assert code == 0, out
+    assert "rig on flange, mount 1" in out
+    code, out, _ = call(capsys, "compare", *folders(before, slipped(after, 2, 1e-3)))
+    assert code == 3
+    assert "The rig has slipped on mount 2 by " in out
+    changed = [line.split("  ")[1] for line in out.splitlines() if "CHANGED" in line]
+    assert changed == ["rig on flange, mount 2"]
+
+
+def test_a_second_mount_that_one_session_lacks_is_one_clear_sentence(capsys, tmp_path):
+    before, other = (drawn_session(tmp_path, name=name) for name in ("before", "other"))
+    second = {"axis": "BC", "ahead_mm": 90.0, "turn_deg": 0.0, "holder": "rods"}
+    other.folder.header["cell"]["second_mount"] = second
+    other.folder.save()
+    for pair in ((before, other), (other, before)):
+        code, out, err = call(capsys, "compare", *folders(*pair))
+        assert (code, out) == (2, "")
+        assert len(err.splitlines()) == 1
+        assert f"only {other.folder.path} has a second mount of its rig (about BC)" in (
+            err
+        )
 
 
 def test_what_cannot_decide_leaves_with_4(capsys, tmp_path):
