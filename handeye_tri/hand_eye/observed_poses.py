@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 _MAX_ITERATIONS = 60
 # A view has converged when no step exceeds this many standard deviations.
 _TOLERANCE = 1e-6
+# A scaled normal matrix whose least eigenvalue is smaller is singular but for rounding.
+_MIN_EIGENVALUE = 1e-13
 # The sphere shift is 0.1 px at most and depends on the depth alone, which the raw
 # pixels give to 1e-3: the second correction changes 1e-4 px, a third nothing.
 _CORRECTIONS = 2
@@ -75,12 +77,14 @@ def triangle_poses(
         marker_radii: Shape (3,), metres; the shift of a sphere's outline against
             its centre is taken off the pixels.
         start: With a single camera: reference_from_triangle roughly, shape (n, 4, 4),
-            NaN where it is not known and the view is left out.
+            NaN where it is not known and the view is left out. Left out, too, are views
+            whose pose does not settle: where the camera stands near the cylinder over
+            the triangle's circumcircle, two poses merge and noise may leave none.
 
     Raises:
         InputError: the shapes do not fit, no view has all three markers in two
             cameras, or a single camera has no start.
-        ConvergenceError: a view did not converge.
+        ConvergenceError: a view of several cameras did not converge, or no view did.
     """
     observed = np.array(pixels, dtype=float)
     m = len(cameras.cameras)
@@ -119,14 +123,14 @@ def triangle_poses(
         if m == 1
         else _procrustes(triangle, cameras, observed, noise[:, views])
     )
-    poses = _refine(triangle, cameras, poses, observed, weight, views)
-    for _ in range(_CORRECTIONS if radii.any() else 0):
-        corrected = observed.copy()
-        for i, camera in enumerate(cameras.cameras):
+    for correction in range(1 + (_CORRECTIONS if radii.any() else 0)):
+        final = observed.copy()
+        for i, camera in enumerate(cameras.cameras if correction else ()):
             local = _camera_points(triangle, cameras, poses, i)
-            corrected[i] -= sphere_shift(camera, local, radii)
-        poses = _refine(triangle, cameras, poses, corrected, weight, views)
-    final = corrected if radii.any() else observed
+            final[i] -= sphere_shift(camera, local, radii)
+        poses, settled = _refine(triangle, cameras, poses, final, weight, views)
+        views, poses = views[settled], poses[settled]
+        observed, final, weight = (x[:, settled] for x in (observed, final, weight))
     normal, _, by_cameras, chi2 = _linearise(triangle, cameras, poses, final, weight)
     inverse = _inverse(normal)
     return ObservedPoses(views, poses, inverse, -inverse @ by_cameras, chi2)
@@ -201,23 +205,48 @@ def _refine(
     pixels: Floats,
     weight: Floats,
     views: NDArray[np.intp],
-) -> Floats:
-    """Gauss-Newton on all views at once, shape (s, 4, 4)."""
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Gauss-Newton on all views at once.
+
+    Returns:
+        Poses, shape (s, 4, 4); which of them settled, which those of several cameras
+        must, shape (s,).
+    """
+    alone = len(cameras.cameras) == 1
+    lost = np.zeros(len(poses), dtype=bool)
     for _ in range(_MAX_ITERATIONS):
         normal, gradient, _, _ = _linearise(triangle, cameras, poses, pixels, weight)
+        if alone:
+            lost |= _singular(normal)
+            normal[lost], gradient[lost] = np.eye(6), 0.0
         covariance = _inverse(normal)
         step = (covariance @ gradient[..., None])[..., 0]
         poses = poses @ se3_exp(step)
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        largest = np.abs(step / std).max(axis=1)
-        if largest.max() < _TOLERANCE:
-            return poses
-    worst = int(np.argmax(largest))
+        largest = np.where(lost, np.inf, np.abs(step / std).max(axis=1))
+        settled = np.asarray(largest < _TOLERANCE)
+        if (settled | lost).all():
+            break
+    if alone:
+        settled &= (_camera_points(triangle, cameras, poses, 0)[..., 2] > 0).all(axis=1)
+    if settled.all() or (alone and settled.any()):
+        return poses, settled
+    worst = int(np.argmax(np.where(settled, -np.inf, largest)))
     raise ConvergenceError(
         f"the triangle's pose at view {views[worst]} did not settle in "
         f"{_MAX_ITERATIONS} iterations (last step {largest[worst]:.2g} sigmas); its "
         "pixels do not fit the triangle, are A, B and C mixed up there?"
     )
+
+
+def _singular(normal: Floats) -> NDArray[np.bool_]:
+    """Normal matrices that do not determine a pose, (s, 6, 6) to (s,)."""
+    diagonal = np.diagonal(normal, axis1=1, axis2=2)
+    fine = np.asarray(np.isfinite(normal).all(axis=(1, 2)) & (diagonal > 0).all(axis=1))
+    scale = 1.0 / np.sqrt(diagonal[fine])
+    scaled = normal[fine] * scale[:, :, None] * scale[:, None, :]
+    fine[fine] = np.linalg.eigvalsh(scaled)[:, 0] > _MIN_EIGENVALUE
+    return ~fine
 
 
 def _inverse(normal: Floats) -> Floats:

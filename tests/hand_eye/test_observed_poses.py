@@ -259,3 +259,45 @@ def test_views_in_a_wrong_order_are_reported(geometry):
             pixels,
             session.pixel_covariance,
         )
+
+
+def test_a_camera_over_the_circumcircle_loses_views_that_have_no_pose(geometry):
+    """Three points and one camera: near that cylinder two poses merge into one."""
+    triangle = geometry.triangle
+    radius = np.linalg.norm(triangle.circumcentre)
+    out = 0.97 * radius * np.array([-0.6, -0.8])
+    over = np.append(triangle.circumcentre + out, 0.0)
+    # Upside down, so that the triangle looks at the camera 0.9 m away.
+    facing = np.diag([1.0, -1.0, -1.0])
+    pose = SE3.from_parts(facing, np.array([0.0, 0.0, 0.9]) - facing @ over)
+    camera = PinholeCamera("left", Intrinsics(1720.0, 1715.0, 0.0, 511.5, 383.5),
+                           (1024, 768))  # fmt: skip
+    calibrated = CameraCalibration(
+        (camera,),
+        (SE3.identity(),),
+        Covariance(("left.fx",), np.eye(1)),
+        0.0,
+        1,
+        np.zeros((1, 1, 3, 2)),
+        1.0,
+        0.0,
+        "truth",
+    )
+    pixels = camera.project(pose.apply(triangle.points))
+    pixels = pixels + 0.1 * np.random.default_rng(0).normal(size=(1, 40, 3, 2))
+    covariance = np.broadcast_to(0.01 * np.eye(2), (1, 40, 3, 2, 2))
+    start = np.tile(pose.matrix, (40, 1, 1))
+    found = triangle_poses(triangle, calibrated, pixels, covariance, start=start)
+    # Noise leaves many of them without a pose that has these pixels.
+    assert 5 < len(found.views) < 35
+    assert found.chi2.max() < 1e-6
+    assert len(found.reference_from_triangle) == len(found.views)
+    lost = np.setdiff1d(np.arange(40), found.views)
+    with pytest.raises(ConvergenceError, match="did not settle"):
+        triangle_poses(
+            triangle,
+            calibrated,
+            pixels[:, lost],
+            covariance[:, lost],
+            start=start[lost],
+        )
