@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import pairwise
+from collections.abc import Iterator, Sequence
+from itertools import chain, groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,10 +19,13 @@ if TYPE_CHECKING:
     from handeye_tri.config import Cell
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
 
 PREVIEW = "plan.rrd"
 # Moments of the moving arm are this far apart, and it stands so long at a station.
 _STEP_S, _STAND_S = 0.08, 1.0
+# A person changes the tool so soon, for those who look on.
+_CHANGE_S = 2.0
 # Views are smaller than the images, by a whole factor, and at most so wide.
 _WIDEST_PX = 512
 
@@ -39,15 +42,18 @@ def write_plan_recording(run: Run) -> tuple[Path, str]:
     from handeye_tri import replay, simulate
 
     plan, arm, cell = run.plan(), run.arm, reduced(run.designed_cell)
-    times, joints, station = driven(
+    times, joints, station, mounts = driven(
         plan, arm.home, arm.speed, cell.arm.acceleration_time_s
     )
+    markers = np.array([one.marker_positions(joints) for one in run.arms])
     motion = replay.PlannedMotion(
         plan,
         times,
         station,
+        mounts,
+        tuple(cell.mount_name(mount) for mount in range(len(cell.mounted))),
         arm.body_poses(joints),
-        arm.marker_positions(joints),
+        markers[mounts, np.arange(len(times))],
         tuple(camera.camera for camera in cell.cameras),
         tuple(arm.base_from_world @ c.world_from_camera for c in cell.cameras),
         np.array(cell.rig.marker_colours),
@@ -59,14 +65,23 @@ def write_plan_recording(run: Run) -> tuple[Path, str]:
     except MissingDependencyError as error:
         missing = str(error)
     else:
-        wanted = [
-            (i, k) for k in motion.arrivals().tolist() for i in range(len(cell.cameras))
-        ]
-        views = simulate.render_views(cell, run.model_path, joints, run.seed, wanted)
+        held = mounts.tolist()
+        # Mount by mount in the order driven, as the recording goes through time.
+        views = chain.from_iterable(
+            simulate.render_views(
+                cell,
+                run.model_path,
+                joints,
+                run.seed,
+                [(i, k) for k in there for i in range(len(cell.cameras))],
+                mounts=held,
+            )
+            for _, there in groupby(motion.arrivals().tolist(), held.__getitem__)
+        )
     replay.write_preview(
         path,
         name=f"{cell.name}, plan",
-        mechanism=run.mechanism,
+        mechanisms=run.mechanisms,
         base_from_world=arm.base_from_world,
         motion=motion,
         certificate=plan_text(plan, cell),
@@ -98,8 +113,10 @@ def reduced(cell: Cell) -> Cell:
 
 def driven(
     plan: Plan, home: Floats, speed: Floats, acceleration_time: float
-) -> tuple[Floats, Floats, NDArray[np.intp]]:
+) -> tuple[Floats, Floats, Ints, Ints]:
     """A programme in time: straight moves from rest to rest, a stop per station.
+
+    For a tool change the arm goes home and waits there.
 
     The slowest joint of a move speeds up evenly, travels at its speed limit if it
     gets there, and slows down evenly; the others keep in step.
@@ -111,24 +128,43 @@ def driven(
         acceleration_time: From rest to full speed, seconds.
 
     Returns:
-        Seconds (t,), joints (t, q), and the station stood at, -1 on the way (t,).
+        Seconds (t,), joints (t, q), the station stood at, -1 on the way (t,), and the
+        mount that holds the triangle (t,).
     """
-    now, times, joints, station = 0.0, [0.0], [home], [-1]
-    here = home
+    times, joints, station = [0.0], [home], [-1]
+    mounts = [plan.stations[0].mount]
+    change = plan.tool_change
+
+    def stood(seconds: float, there: Floats, index: int, mount: int) -> None:
+        times.append(times[-1] + seconds)
+        joints.append(there)
+        station.append(index)
+        mounts.append(mount)
+
+    def moved(way: Sequence[Floats]) -> None:
+        for start, end in pairwise([joints[-1], *way]):
+            cruise = float((np.abs(end - start) / speed).max())
+            moments, shares = _move(cruise, acceleration_time)
+            times.extend((times[-1] + moments).tolist())
+            joints.extend(start + share * (end - start) for share in shares)
+            station.extend([-1] * len(moments))
+            mounts.extend([mounts[-1]] * len(moments))
+
     for index, (stop, via) in enumerate(zip(plan.stations, plan.via, strict=True)):
-        for start, end in pairwise([here, *via, stop.joints]):
-            moments, shares = _move(float((np.abs(end - start) / speed).max()),
-                                    acceleration_time)  # fmt: skip
-            times += (now + moments).tolist()
-            joints += [start + share * (end - start) for share in shares]
-            station += [-1] * len(moments)
-            now = times[-1]
+        if change is not None and change.before == index:
+            moved([*change.via, change.joints])
+            stood(0.5 * _CHANGE_S, change.joints, -1, mounts[-1])
+            stood(0.5 * _CHANGE_S, change.joints, -1, stop.mount)
+        moved([*via, stop.joints])
         # Arrival and departure.
-        times += [now + _STEP_S, now + _STAND_S]
-        joints += [stop.joints] * 2
-        station += [index] * 2
-        now, here = times[-1], stop.joints
-    return np.array(times), np.array(joints), np.array(station, dtype=np.intp)
+        stood(_STEP_S, stop.joints, index, stop.mount)
+        stood(_STAND_S - _STEP_S, stop.joints, index, stop.mount)
+    return (
+        np.array(times),
+        np.array(joints),
+        np.array(station, dtype=np.intp),
+        np.array(mounts, dtype=np.intp),
+    )
 
 
 def _move(cruise: float, acceleration_time: float) -> tuple[Floats, Floats]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,13 @@ from handeye_tri.camera import PinholeCamera
 from handeye_tri.errors import InputError
 from handeye_tri.mechanism import Mechanism
 from handeye_tri.records import Plan
-from handeye_tri.replay.drawing import IMAGE_DISTANCE, body_path, log_cell, log_pinhole
+from handeye_tri.replay.drawing import (
+    IMAGE_DISTANCE,
+    body_path,
+    log_cell,
+    log_mount,
+    log_pinhole,
+)
 from handeye_tri.replay.engine import only_views, recorded, rr, rrb, transform
 from handeye_tri.replay.layout import space
 from handeye_tri.replay.overlay import CORNER
@@ -48,6 +54,8 @@ class PlannedMotion:
         plan: The programme.
         times: Seconds since its start, shape (t,), ascending.
         station: Where the robot stands then, -1 on the way, shape (t,).
+        mounts: Which mount holds the triangle then, from 0, shape (t,).
+        mount_names: What the mounts are called.
         world_from_body: Poses of the mechanism's bodies, (t, bodies, 4, 4), metres.
         markers: A, B, C in the base, shape (t, 3, 3), metres.
         cameras: The m cameras as the cell describes them.
@@ -58,6 +66,8 @@ class PlannedMotion:
     plan: Plan
     times: Floats
     station: NDArray[np.intp]
+    mounts: NDArray[np.intp]
+    mount_names: tuple[str, ...]
     world_from_body: Floats
     markers: Floats
     cameras: tuple[PinholeCamera, ...]
@@ -94,7 +104,7 @@ def write_preview(
     path: Path,
     *,
     name: str,
-    mechanism: Mechanism,
+    mechanisms: Sequence[Mechanism],
     base_from_world: SE3,
     motion: PlannedMotion,
     certificate: str,
@@ -107,7 +117,7 @@ def write_preview(
     Args:
         path: The file, ``.rrd``.
         name: Names the recording in the viewer.
-        mechanism: The compiled cell.
+        mechanisms: The compiled cell with each mount; their bodies are the same.
         base_from_world: Where the world is, seen from the robot's base.
         motion: What the arm does.
         certificate: What the plan promises, plain text.
@@ -122,7 +132,7 @@ def write_preview(
     view = next(rendered, None)
     pictured = [False] * len(motion.cameras)
     with recorded(path, name, _layout(motion, base_from_world)) as recording:
-        log_cell(recording, (mechanism,), base_from_world)
+        log_cell(recording, mechanisms, base_from_world)
         _log_still(recording, motion, images, arrivals, certificate)
         for k, time in enumerate(motion.times):
             recording.reset_time()
@@ -131,8 +141,15 @@ def write_preview(
             if j >= 0 and k == arrivals[j]:
                 recording.set_time(STATION, sequence=j)
                 recording.log("log", rr.TextLog(_words(motion.plan, j), level="INFO"))
+            mount = int(motion.mounts[k])
+            changed = k > 0 and mount != motion.mounts[k - 1]
+            if changed:
+                words = f"tool change: {motion.mount_names[mount]}"
+                recording.log("log", rr.TextLog(words, level="INFO"))
+            if len(mechanisms) > 1 and (k == 0 or changed):
+                log_mount(recording, mechanisms, mount)
             for body, pose in enumerate(motion.world_from_body[k][1:], 1):
-                recording.log(body_path(mechanism, body), transform(pose))
+                recording.log(body_path(mechanisms[0], body), transform(pose))
             seen = dict[int, NDArray[np.uint8]]()
             while view is not None and view[1] == k:
                 seen[view[0]] = view[2]

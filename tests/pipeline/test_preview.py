@@ -29,7 +29,8 @@ def in_time(run):
 
 def test_the_arm_keeps_its_limits_and_the_stated_time(run):
     plan, arm = run.plan(), run.arm
-    times, joints, station = in_time(run)
+    times, joints, station, mounts = in_time(run)
+    assert not mounts.any()
     assert (np.diff(times) > 0).all()
     standing = len(plan.stations) * 1.0
     assert times[-1] - standing == pytest.approx(plan.certificate["cycle_time_s"])
@@ -47,10 +48,12 @@ def test_ways_are_straight_and_pass_their_points():
     from types import SimpleNamespace
 
     home, speed = np.zeros(2), np.array([1.0, 2.0])
-    stop = SimpleNamespace(joints=np.array([1.0, -1.0]))
+    stop = SimpleNamespace(joints=np.array([1.0, -1.0]), mount=0)
     via = np.array([[0.5, 0.5]])
-    plan = SimpleNamespace(stations=(stop, stop), via=(via, np.zeros((0, 2))))
-    times, joints, station = driven(plan, home, speed, 0.3)
+    plan = SimpleNamespace(
+        stations=(stop, stop), via=(via, np.zeros((0, 2))), tool_change=None
+    )
+    times, joints, station, _ = driven(plan, home, speed, 0.3)
     at = int(np.argmin(np.linalg.norm(joints - via[0], axis=1)))
     np.testing.assert_allclose(joints[at], via[0], atol=1e-12)
     expected = travel_time(home, via[0], speed, 0.3)
@@ -64,10 +67,10 @@ def test_ways_are_straight_and_pass_their_points():
 
 
 def test_images_hold_what_the_plan_promises(run):
-    times, joints, station = in_time(run)
+    times, joints, station, mounts = in_time(run)
     cell, arm = run.designed_cell, run.arm
     motion = PlannedMotion(
-        run.plan(), times, station, arm.body_poses(joints),
+        run.plan(), times, station, mounts, ("the only",), arm.body_poses(joints),
         arm.marker_positions(joints), tuple(c.camera for c in cell.cameras),
         tuple(arm.base_from_world @ c.world_from_camera for c in cell.cameras),
         np.array(cell.rig.marker_colours),
@@ -77,9 +80,9 @@ def test_images_hold_what_the_plan_promises(run):
     assert np.isnan(seen[:, station < 0]).any()
     with pytest.raises(InputError, match="never stands at station 0"):
         PlannedMotion(
-            run.plan(), times, np.full(len(times), -1), motion.world_from_body,
-            motion.markers, motion.cameras, motion.base_from_camera,
-            motion.marker_colours,
+            run.plan(), times, np.full(len(times), -1), mounts, ("the only",),
+            motion.world_from_body, motion.markers, motion.cameras,
+            motion.base_from_camera, motion.marker_colours,
         )  # fmt: skip
 
 
@@ -158,3 +161,51 @@ def test_a_session_without_a_plan_recording_says_so(run, capsys, tmp_path):
     (tmp_path / "plan.rrd").rename(run.folder.file("plan.rrd"))
     assert left.value.code == 2
     assert f"handeye-tri plan {run.folder.path}" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("preview_both") / "out"
+    with pytest.raises(SystemExit):
+        main(["plan", str(folder), "--cell", "hp3_stereo_both", "--half-turns", "4"])
+    return Run(storage.SessionFolder.open(folder), NullProgress())
+
+
+def test_the_arm_waits_at_home_while_the_tool_is_changed(both):
+    plan, arm = both.plan(), both.arm
+    times, joints, station, mounts = in_time(both)
+    (changed,) = np.flatnonzero(np.diff(mounts)) + 1
+    np.testing.assert_array_equal(joints[changed], arm.home)
+    np.testing.assert_array_equal(joints[changed - 1], arm.home)
+    before = plan.tool_change.before
+    assert station[:changed].max() == before - 1
+    assert station[changed:][station[changed:] >= 0].min() == before
+    standing = len(plan.stations) * 1.0 + 2.0
+    assert times[-1] - standing == pytest.approx(plan.certificate["cycle_time_s"])
+
+
+def test_each_station_is_seen_with_its_mount(both):
+    """The holder in the recording, the words, and markers inside every image."""
+    reader = RrdReader(both.folder.file("plan.rrd"))
+    chunks = list(reader.stream().to_chunks())
+    logged = [
+        text
+        for chunk in chunks
+        if str(chunk.entity_path) == "/log"
+        for text in chunk.to_record_batch().column("TextLog:text").to_pylist()
+    ]
+    said = [text for texts in logged for text in texts]
+    assert said.count("tool change: mount 2 (about its edge BC)") == 1
+    holders = {
+        str(chunk.entity_path).split("/mount_")[1][0]
+        for chunk in chunks
+        if "/mount_" in str(chunk.entity_path)
+    }
+    assert holders == {"1", "2"}
+    images = sum(
+        chunk.num_rows
+        for chunk in chunks
+        if str(chunk.entity_path).endswith("left/image")
+        and any("Image" in str(n) for n in chunk.to_record_batch().schema.names)
+    )
+    assert images >= len(both.plan().stations)
