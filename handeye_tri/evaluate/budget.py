@@ -101,7 +101,8 @@ def _explained(
     scaled = covariance[np.ix_(index, index)] / np.outer(std, std)
     columns = covariance[:, index] / std
     inverse = np.linalg.pinv(scaled, rcond=1e-11, hermitian=True)
-    return float(np.einsum("ij,jk,lk,il->", columns, inverse, columns, weight))
+    # The trace of weight @ columns @ inverse @ columns.T.
+    return float(((weight @ columns) * (columns @ inverse)).sum())
 
 
 def _parameters(calibration: HandEyeCalibration) -> tuple[list[str], Floats]:
