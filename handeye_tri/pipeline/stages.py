@@ -50,6 +50,7 @@ def _plan(run: Run) -> tuple[list[str], str]:
     return ["plan.json"], (
         f"{counted(len(plan.half_turns), 'half-turn')}, "
         f"{counted(len(plan.stations) - held_out, 'station')} + {held_out} held out, "
+        f"{'a tool change, ' if plan.tool_change else ''}"
         f"{plan.certificate['cycle_time_s']:.0f} s; expect "
         f"{plan.certificate['track_predicted_rms_mm']:.3f} mm rms; {plan.outcome}"
     )

@@ -64,6 +64,7 @@ def test_it_passes_with_half_turns_on_both_mounts(run):
     assert set(made) == {(0, "normal"), (1, "BC")}
     assert len(made) == 6
     assert np.isfinite(session.pixels).all()
+    assert "a tool change" in run.folder.header["stages"]["plan"]["line"]
     change = f"Tool change before station {plan.tool_change.before}, to mount 2 (about"
     assert change in plan_text(plan, run.cell)
 
