@@ -49,18 +49,19 @@ def _steps(session: Session) -> list[Cause]:
     """The rig on its mount, or one camera, is elsewhere from some station on."""
     m, n = session.pixels.shape[:2]
     mounts = session.mounts
-    count = len(set(mounts.tolist()))
+    several = bool(mounts.any())
+    slips = _where_a_rig_may_slip(mounts)
     causes = []
     for station in range(1, n):
         step = np.zeros((n, 6, 6))
         step[station:] = np.eye(6)
-        mount = int(mounts[station])
-        if mount in mounts[:station]:
+        if station in slips:
+            mount = int(mounts[station])
             # With another mount the rig is elsewhere anyway.
             held = step * (mounts == mount)[:, None, None]
-            label = session.mount_name(mount) if count > 1 else ""
+            label = session.mount_name(mount) if several else ""
             causes.append(
-                Cause("rig", held, station=station, siblings=n - count, label=label)
+                Cause("rig", held, station=station, siblings=len(slips), label=label)
             )
         for i in range(m):
             if np.isfinite(session.pixels[i, :station]).any():
@@ -68,6 +69,21 @@ def _steps(session: Session) -> list[Cause]:
                     Cause("camera", np.zeros((n, 6, 6)), i, step, station, n - 1)
                 )
     return causes
+
+
+def _where_a_rig_may_slip(mounts: NDArray[np.intp]) -> set[int]:
+    """Stations before which it may, not the first of a mount.
+
+    A single station between that and a tool change would be one where the robot was
+    elsewhere.
+    """
+    slips: set[int] = set()
+    for mount in np.unique(mounts):
+        own = np.flatnonzero(mounts == mount).tolist()
+        first = 1 if own[0] == 0 else 2
+        last = len(own) if own[-1] == len(mounts) - 1 else len(own) - 1
+        slips |= set(own[first:last])
+    return slips
 
 
 def _single_stations(session: Session) -> list[Cause]:

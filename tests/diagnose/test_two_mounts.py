@@ -84,6 +84,17 @@ def test_a_rig_that_slips_is_named_with_its_mount(station, name):
     assert finding.cause == f"the rig moved on {name} in the middle of the session"
 
 
+@pytest.mark.parametrize("station", [CHANGE - 1, CHANGE])
+def test_a_single_station_beside_the_tool_change_is_no_slip(station):
+    true = geometry(2)
+    session = observed(true, 2)
+    stations = list(session.stations)
+    pose = stations[station].base_from_flange @ moved(2.0, 0.3, seed=6)
+    stations[station] = replace(stations[station], base_from_flange=pose)
+    (finding,) = told(replace(session, stations=tuple(stations)), true)
+    assert (finding.code, finding.stations) == ("POSE", (station,))
+
+
 def test_a_camera_that_moved_in_the_tool_change_is_no_rig():
     true = geometry(2)
     places = list(true.base_from_camera)
