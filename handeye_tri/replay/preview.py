@@ -141,13 +141,8 @@ def write_preview(
             if j >= 0 and k == arrivals[j]:
                 recording.set_time(STATION, sequence=j)
                 recording.log("log", rr.TextLog(_words(motion.plan, j), level="INFO"))
-            mount = int(motion.mounts[k])
-            changed = k > 0 and mount != motion.mounts[k - 1]
-            if changed:
-                words = f"tool change: {motion.mount_names[mount]}"
-                recording.log("log", rr.TextLog(words, level="INFO"))
-            if len(mechanisms) > 1 and (k == 0 or changed):
-                log_mount(recording, mechanisms, mount)
+            if len(mechanisms) > 1:
+                _log_change(recording, mechanisms, motion, k)
             for body, pose in enumerate(motion.world_from_body[k][1:], 1):
                 recording.log(body_path(mechanisms[0], body), transform(pose))
             seen = dict[int, NDArray[np.uint8]]()
@@ -167,6 +162,26 @@ def write_preview(
                 _log_outline(
                     recording, motion, camera.name, images[i, k], j, not pictured[i]
                 )
+
+
+def _log_change(
+    recording: rr.RecordingStream,
+    mechanisms: Sequence[Mechanism],
+    motion: PlannedMotion,
+    moment: int,
+) -> None:
+    """The holder where it is new, by time and at the station that comes next."""
+    mount = int(motion.mounts[moment])
+    if moment > 0 and mount == motion.mounts[moment - 1]:
+        return
+    ahead = motion.station[moment:]
+    recording.set_time(STATION, sequence=int(ahead[ahead >= 0][0]))
+    if moment > 0:
+        words = f"tool change: {motion.mount_names[mount]}"
+        recording.log("log", rr.TextLog(words, level="INFO"))
+    log_mount(recording, mechanisms, mount)
+    recording.reset_time()
+    recording.set_time(TIME, duration=float(motion.times[moment]))
 
 
 def _colour(plan: Plan, station: int) -> Colour:

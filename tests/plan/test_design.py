@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handeye_tri.plan.design import Design
+from handeye_tri.plan.design import Design, Kinds
 
 ALL = 9
 
@@ -112,3 +112,35 @@ def test_swaps_are_all_that_cost_less_than_a_limit(seed):
     found = design.swaps([0, 2, 5, 8], 2, usable, limit)
     assert found.tolist() == [k for k, cost in costs.items() if cost < limit]
     assert len(found) > 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_exchange_leaves_enough_of_each_kind(seed):
+    """The best of all choices with two of each kind at least, or nearly."""
+    parts = problem(seed)
+    kinds = Kinds(np.arange(ALL) // 6, (2, 2))
+    design = Design(*parts, kinds)
+    usable = np.ones(ALL, dtype=bool)
+    start = kinds.filled([], np.arange(ALL), 4)
+    assert sorted(start) == [0, 1, 6, 7]
+    chosen = design.exchange(start, usable)
+    able = [c for c in combinations(range(ALL), 4) if not kinds.lacking(list(c))]
+    best = min(price(*parts, ones(c)) for c in able)
+    assert not kinds.lacking(chosen)
+    assert price(*parts, ones(chosen)) <= 1.05 * best
+    # Two of a kind: only one of the same may come for one of them.
+    for place, current in enumerate(chosen):
+        other = design.swaps(chosen, place, usable, np.inf)
+        assert set(kinds.of[other]) == {kinds.of[current]}
+
+
+def test_a_choice_is_filled_by_kind_first_and_then_by_rank():
+    kinds = Kinds(np.array([0, 0, 0, 1, 1, 1]), (1, 1))
+    ranked = np.array([2, 1, 0, 5, 4, 3])
+    assert kinds.filled([], ranked, 3) == [2, 5, 1]
+    assert kinds.filled([5], ranked, 3) == [5, 2, 1]
+    assert kinds.lacking([0, 1]) == [1]
+    assert kinds.lacking([]) == [0, 1]
+    # With one more of its kind than needed, any may come instead.
+    assert kinds.instead([0, 1, 3], 0).all()
+    assert kinds.instead([0, 1, 3], 3).tolist() == [False] * 3 + [True] * 3
