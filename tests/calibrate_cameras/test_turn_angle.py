@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from half_turn_damage import SIGMA, turned_by_170
-from half_turn_scene import IMAGE_SIZE, half_turn, make_scene
+from half_turn_scene import IMAGE_SIZE, camera, half_turn, make_scene
 from scipy.stats import binom, chi2
 
 from handeye_tri.calibrate_cameras import calibrate_camera
@@ -16,6 +18,7 @@ from handeye_tri.calibrate_cameras.outlier_tests import TURN_FREEDOM
 from handeye_tri.calibrate_cameras.outliers import gain_of_another_turn
 from handeye_tri.calibrate_cameras.refine import HalfTurnModel, State
 from handeye_tri.calibrate_cameras.turn_angle import other_turns, turned
+from handeye_tri.camera import Lens
 
 
 def read(scene, before, after, sigma=SIGMA):
@@ -64,6 +67,41 @@ def test_the_true_angle_is_among_those_that_fit(axis, angle) -> None:
         exact = [turn for turn in turns if turn.square < 1e-9]
         off = min(abs(np.degrees(turn.angle) - angle) for turn in exact)
         assert off < 1e-5
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Lens("radtan", np.array([-0.2, 0.06, 1e-3, -5e-4, 0.0])),
+        Lens("rational", np.array([0.1, -0.05, 5e-4, 3e-4, 0.0, 0.2, 0.0, 0.0])),
+    ],
+)
+def test_the_true_angle_is_found_through_a_lens(lens) -> None:
+    view = camera(lens=lens)
+    scene = make_scene(np.random.default_rng(5), 2, "CA", angle_deg=165.0, view=view)
+    data, state = read(scene, scene.before, scene.after)
+    state = replace(state, lens=np.array(lens.coefficients))
+    for i in range(2):
+        turns = other_turns(data.take([i]), build, state, np.zeros((5, 5)))
+        best = min(turns, key=lambda turn: turn.square)
+        assert np.degrees(best.angle) == pytest.approx(165.0, abs=1e-5)
+
+
+def test_the_true_angle_is_found_where_each_half_turn_has_its_own_foot() -> None:
+    scene = make_scene(np.random.default_rng(6), 2, angle_deg=172.0)
+    data, state = read(scene, scene.before, scene.after)
+    elsewhere = replace(state, o=state.o + 0.01)
+
+    def build_free(part, rows):
+        choice = IntrinsicChoice.of(True, {}, None)
+        return HalfTurnModel(
+            part, choice=choice, lens=(), o_mode="free", turn_covariance=None
+        )
+
+    turns = other_turns(data.take([0]), build_free, elsewhere, np.zeros((5, 5)))
+    exact = [turn for turn in turns if turn.square < 1e-9]
+    off = min(abs(np.degrees(turn.angle) - 172.0) for turn in exact)
+    assert off < 1e-5
 
 
 def test_the_angle_s_sigma_is_its_spread() -> None:
