@@ -42,8 +42,8 @@ Indices = NDArray[np.intp]
 _FROM_HALF = 3.0
 # Below this no error of an angle is likelier than a smaller one, radians.
 _LEAST_OFF = float(np.radians(0.1))
-# Angles do as well as another that leave no more chi-square than this in addition.
-_ALIKE = 4.0
+# Angles are ruled out by another that leaves so much less chi-square: three sigmas.
+_RULED_OUT = 9.0
 # Two images are the same where no marker moved by more sigmas than this.
 _SAME = 6.0
 # Weight of a marker that is left out; zero would leave its homography undefined.
@@ -199,16 +199,16 @@ def _other_angles(
         off = abs(turn.angle - np.pi)
         if off < _FROM_HALF * np.sqrt(scale) * turn.sigma:
             continue
-        alike = {
+        possible = {
             f"{_degrees(other):.1f}"
             for other in turns
-            if other.square - turn.square < _ALIKE * scale
+            if other.square - turn.square < _RULED_OUT * scale
         }
-        alike -= {f"{_degrees(turn):.1f}"}
+        possible -= {f"{_degrees(turn):.1f}"}
         sigma = np.degrees(np.sqrt(scale) * turn.sigma)
         yield _Account(
             f"a turn of {_degrees(turn):.1f} +- {max(sigma, 0.1):.1f} degrees, not 180"
-            + (f"; {', '.join(sorted(alike))} would do as well" if alike else ""),
+            + (f"; {', '.join(sorted(possible))} not ruled out" if possible else ""),
             turn.square,
             5,
             # Either way, and in each octave alike: small errors are likelier.

@@ -65,5 +65,5 @@ def turned_by_170(
     motion = half_turn(scene.triangle, scene.axes[i], scene.foot, 170.0)
     after[i] = project(scene.camera, scene.triangle, scene.poses[i] @ motion)
     after[i] += sigma * rng.standard_normal((3, 2))
-    # Where several angles do as well it must be among them.
+    # Where several angles are possible it must be among them.
     return r"a turn of .*\b1(6[5-9]|7[0-5])\.|outside the"

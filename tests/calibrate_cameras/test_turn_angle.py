@@ -167,3 +167,23 @@ def test_a_turn_seen_from_elsewhere_is_told_from_a_half_turn() -> None:
         # a turn of 170.2 +- 0.4 degrees, not 180
         angle, sigma = float(words[3]), float(words[5])
         assert abs(angle - 170.0) < 4.0 * sigma + 0.05
+
+
+def test_angles_that_are_possible_too_are_said() -> None:
+    """Seen from two of the places, this turn of 170 degrees is one of 178.3, too."""
+    rng = np.random.default_rng([11, 41])
+    scene = make_scene(rng, 20, "AB")
+    before, after = scene.noisy(rng, SIGMA)
+    for i in rng.choice(20, 4, replace=False).tolist():
+        turned_by_170(scene, before, after, i, rng)
+    found = calibrate_camera(
+        before,
+        after,
+        scene.triangle,
+        image_size=IMAGE_SIZE,
+        axis="AB",
+        sigma_px=SIGMA,
+        reject=True,
+    )
+    why = found.details["dropped"][0]
+    assert why == "a turn of 178.3 +- 0.2 degrees, not 180; 170.1 not ruled out"
