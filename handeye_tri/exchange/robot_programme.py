@@ -117,12 +117,14 @@ class Programme:
         return not any(len(points) for points in ways)
 
     def called(self, station: int) -> str:
-        """A station's number, by tool where there are two."""
+        """A station's number: of two sessions, in its own; and the tool there."""
         if self.change is None:
             return str(station)
         after = station >= self.change.before
-        number = station - self.change.before if after else station
-        return f"{number} of {self.change.tools[int(after)]}"
+        tool = self.change.tools[int(after)]
+        if self.mounts is not None:
+            return f"{station}, {tool}"
+        return f"{station - self.change.before if after else station} of {tool}"
 
 
 def programme_json(programme: Programme) -> str:

@@ -191,7 +191,8 @@ def test_the_other_formats_wait_between_the_mounts(both, layout, tmp_path):
     if layout == "urscript":
         _, after = text.split("popup(")
         assert stated in after.splitlines()[0]
-        assert 'textmsg("station ", "0 of mount 2 (about its edge BC)")' in after
+        first = f"{both.plan().tool_change.before}, mount 2 (about its edge BC)"
+        assert f'textmsg("station ", "{first}")' in after
     else:
         _, after = text.split("---\n")
         assert stated in after.splitlines()[0]
