@@ -204,12 +204,13 @@ def _bag(run: Run, results: Results) -> exchange.Bag:
         "session": {key: header[key] for key in _HEADER if key in header},
     }
     if plan.tool_change is not None:
-        about["tool_change"] = {"before": plan.tool_change.before}
+        before = plan.tool_change.before
+        mount = plan.stations[before].mount
+        about["tool_change"] = {"before": before, "mount": mount}
         about["notice"] = [
             *results.head,
-            f"The tool is changed before station {plan.tool_change.before}: the frame "
-            "triangle moves on the flange then, and the robot's description has no "
-            "holder.",
+            f"The tool is changed before station {before}: the frame triangle moves on "
+            "the flange then, and the robot's description has no holder.",
         ]
 
     def photograph(camera: str, station: int) -> bytes | None:

@@ -301,12 +301,25 @@ def _cell_of(bag: BagFile, source: Path) -> tuple[CellToCalibrate, str, str]:
 
 
 def _tool_change_of(bag: BagFile) -> int | None:
-    """The first station with the second mount, as an exported session carries it."""
+    """The first station with the second mount, as an exported session carries it.
+
+    Raises:
+        InputError: the session begins with the second mount.
+    """
     try:
-        change = json.loads(bag.about() or "{}")["tool_change"]["before"]
+        change = json.loads(bag.about() or "{}")["tool_change"]
+        before, mount = change["before"], change["mount"]
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
-    return change if type(change) is int else None
+    if type(before) is not int:
+        return None
+    if mount == 0:
+        raise InputError(
+            f"{bag.path}: this session begins with its second mount; exchange rig and "
+            f"second_mount in a cell of your own, and name it with --cell, and "
+            f"--tool-change {before}"
+        )
+    return before
 
 
 def _forward(cell: Cell, model: Path, joints: Sequence[str]) -> Forward:

@@ -12,6 +12,7 @@ import pytest
 from drawn_session import few_replicates
 
 from handeye_tri import cli
+from handeye_tri.exchange.bags import BagFile
 from handeye_tri.pipeline import (
     STAGES,
     VERBS,
@@ -95,6 +96,20 @@ def test_the_bag_brings_the_tool_change_with_it(run, imported):
     mine, other = run.hand_eye(), back.hand_eye()
     for one, again in zip(mine.mounts, other.mounts, strict=True):
         np.testing.assert_allclose(again.markers, one.markers, atol=1e-9)
+
+
+def test_a_bag_that_begins_with_the_second_mount_is_not_guessed(
+    run, imported, monkeypatch, capsys
+):
+    bag = run.folder.path.parent / "session.mcap"
+    about = {"session": {"cell": run.folder.header["cell"]}}
+    about["tool_change"] = {"before": 7, "mount": 0}
+    monkeypatch.setattr(BagFile, "about", lambda self: json.dumps(about))
+    with pytest.raises(SystemExit) as left:
+        cli.main(["import", "bag", str(bag), "-o", str(bag.with_name("new"))])
+    assert left.value.code == 2
+    assert "begins with its second mount" in capsys.readouterr().err
+    assert not bag.with_name("new").exists()
 
 
 def test_the_json_follows_its_schema(run):
