@@ -186,6 +186,7 @@ CAUSES: dict[str, Explanation] = {
         (
             "a side was measured wrongly, or not between the marker centres",
             "markers sit otherwise than in the drawing",
+            "after a tool change: another triangle, or a marker that moved in it",
             "where all sides are off by one factor: the robot's own lengths",
         ),
         "The sides |AB|, |AC| and the angle at A by the robot's motions with their "
