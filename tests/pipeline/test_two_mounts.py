@@ -23,6 +23,7 @@ from handeye_tri.pipeline import (
     start,
 )
 from handeye_tri.pipeline.execution import inputs_of
+from handeye_tri.pipeline.programme import plan_more
 from handeye_tri.replay.recording import read_numbers
 from handeye_tri.storage import SessionFolder
 from handeye_tri.summary import plan_text
@@ -52,6 +53,26 @@ def imported(run):
     with back.folder.locked():
         execute(back, stages_of(back), ("detect", "calibrate"), again=False)
     return back, printed.getvalue()
+
+
+def test_more_half_turns_begin_with_the_mount_that_the_arm_carries(run):
+    more, path = plan_more(run, 4)
+    carried = run.plan().stations[-1].mount
+    mounts = [station.mount for station in more.stations]
+    assert len(more.half_turns) == 4
+    if more.tool_change is None:
+        assert set(mounts) == {carried}
+    elif more.tool_change.before:
+        assert mounts[0] == carried
+    else:
+        assert carried not in mounts
+    whole = run.plan().certificate["track_calibration_rms_mm"]
+    assert more.certificate["track_calibration_rms_mm"] < whole
+    assert more.certificate["mount_1.half_turns"] >= 2
+    if path.suffix == ".csv":
+        rows = [line.split(",") for line in path.read_text().splitlines()]
+        assert [row[-1] for row in rows] == ["mount", *(str(m + 1) for m in mounts)]
+    path.unlink()
 
 
 def test_it_passes_with_half_turns_on_both_mounts(run):
