@@ -134,13 +134,18 @@ def plan_text(plan: Plan, cell: CellToCalibrate) -> str:
             for finding in plan.findings
             for line in wrap(finding, 86, initial_indent="  ", subsequent_indent="    ")
         ),
-        "",
-        f"{'EXPECTED':<43}+- (1 sd)",
     ]
-    for name, value in number.items():
-        if name.startswith("sigma."):
-            label, unit = _unit(name.removeprefix("sigma."))
-            lines.append(f"  {label + unit:<36}{value:>12.{digits(value)}f}")
+    sigmas = {
+        "".join(_unit(name.removeprefix("sigma."))): value
+        for name, value in number.items()
+        if name.startswith("sigma.")
+    }
+    width = max(36, *map(len, sigmas))
+    lines += ["", f"{'EXPECTED':<{width + 7}}+- (1 sd)"]
+    lines += [
+        f"  {label:<{width}}{value:>12.{digits(value)}f}"
+        for label, value in sigmas.items()
+    ]
     return "\n".join(lines)
 
 
