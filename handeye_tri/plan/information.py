@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from handeye_tri.camera import INTRINSIC_NAMES
 from handeye_tri.config import Cell
+from handeye_tri.counting import counted
+from handeye_tri.errors import InputError
 from handeye_tri.plan.poses import HALF_TURN, View
 from handeye_tri.records import (
     Covariance,
@@ -66,6 +68,7 @@ class StationInformation:
         labels: Names of the p unknowns, as in a calibration's covariance.
         sigma_px: Standard deviation of a detected centre per axis, pixels.
         views: Cameras and rig, by mount.
+        names: What a person calls the mounts.
         base_from_world: Shape (4, 4), metres.
         prior: Weak information on every unknown, shape (p, p).
     """
@@ -86,6 +89,7 @@ class StationInformation:
             sigma_px: Of a detected centre, per axis, pixels.
         """
         self.views = tuple(View(mounted) for mounted in cell.mounted)
+        self.names = tuple(cell.mount_name(k) for k in range(len(self.views)))
         self.base_from_world = base_from_world
         self._camera_from_base = se3_inverse(
             base_from_world @ self.views[0].world_from_camera
@@ -262,12 +266,25 @@ class StationInformation:
 
     @cached_property
     def places(self) -> tuple[Places, ...]:
-        """Where the track error is predicted, by mount: all over the workspace box."""
+        """Where the track error is predicted, by mount: all over the workspace box.
+
+        Raises:
+            InputError: no place there is seen.
+        """
         found = []
         for mount, view in enumerate(self.views):
             world = view.draw(np.random.default_rng(0), _DRAWN_PLACES)
             seen = view.seen(world)
             enough = np.flatnonzero(seen.sum(axis=1) >= view.required)[:_PLACES]
+            if len(enough) == 0:
+                cell = view.cell
+                whose = f" of {self.names[mount]}" if len(self.views) > 1 else ""
+                raise InputError(
+                    f"cell {cell.name!r}: of {_DRAWN_PLACES} poses in the workspace "
+                    f"box none shows the triangle{whose} to "
+                    f"{counted(view.required, 'camera')}; turn the cameras there, or "
+                    "move plan.workspace_min_m and workspace_max_m to what they see"
+                )
             poses = np.asarray(self.base_from_world @ world[enough])
             mounts = np.full(len(enough), mount, dtype=np.intp)
             found.append(Places(poses, seen[enough], mounts))

@@ -162,3 +162,16 @@ def test_the_way_home_to_the_tool_change_is_looked_at(monkeypatch):
 def test_wrong_mounts_are_refused(mounts, message):
     with pytest.raises(InputError, match=message):
         certified_with_both(np.zeros((4, 6)), mounts)
+
+
+@pytest.mark.parametrize(
+    ("name", "whose"), [(NAME, ""), (BOTH, "of mount 1 \\(about a normal\\) ")]
+)
+def test_a_box_that_no_camera_sees_is_named(name, whose):
+    cameras = scene.cell_of(name).model_dump()["cameras"]
+    away = [{**camera, "look_at_m": (3.0, 0.0, 0.4)} for camera in cameras]
+    cell = scene.changed(name, cameras=away)
+    mounts = [0] * 4
+    message = f"workspace box none shows the triangle {whose}to 2 cameras; turn the cam"
+    with pytest.raises(InputError, match=message):
+        certify_stations(cell, scene.arms_of(name), np.zeros((4, 6)), mounts)
