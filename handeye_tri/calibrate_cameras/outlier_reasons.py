@@ -38,9 +38,7 @@ from handeye_tri.triangle import VERTICES
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-# An angle is another than 180 degrees where it is off by so many sigmas.
-_FROM_HALF = 3.0
-# Below this no error of an angle is likelier than a smaller one, radians.
+# An error of an angle that counts as one, and the likeliest, radians.
 _LEAST_OFF = float(np.radians(0.1))
 # Angles are ruled out by another that leaves so much less chi-square: three sigmas.
 _RULED_OUT = 9.0
@@ -197,7 +195,7 @@ def _other_angles(
     turns = other_turns(data, build, consensus.state, consensus.spread)
     for turn in turns:
         off = abs(turn.angle - np.pi)
-        if off < _FROM_HALF * np.sqrt(scale) * turn.sigma:
+        if off < _LEAST_OFF:
             continue
         possible = {
             f"{_degrees(other):.1f}"
