@@ -72,8 +72,16 @@ def calibrated(session: Session) -> HandEyeCalibration:
     return adjust(kept, calibrate_hand_eye(kept, cameras))
 
 
-def from_truth(session: Session, truth: GroundTruth) -> HandEyeCalibration:
-    """The joint adjustment alone, started where it should end."""
+def from_truth(
+    session: Session, truth: GroundTruth, correlation: float | None = None
+) -> HandEyeCalibration:
+    """The joint adjustment alone, started where it should end.
+
+    Args:
+        session: What was seen.
+        truth: Where to start.
+        correlation: That of detection errors of a marker on the axis; None: estimated.
+    """
     start = HandEyeCalibration(
         truth.cameras,
         truth.base_from_camera,
@@ -86,7 +94,7 @@ def from_truth(session: Session, truth: GroundTruth) -> HandEyeCalibration:
         "the truth",
         other_mounts=truth.other_mounts,
     )
-    return adjust(session, start)
+    return adjust(session, start, on_axis_correlation=correlation)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
