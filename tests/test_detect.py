@@ -209,6 +209,28 @@ def test_a_cap_of_a_ball_is_not_a_smaller_ball(shown: float) -> None:
         assert not off > 0.5
 
 
+def test_a_ball_before_a_dark_and_a_light_thing_is_whole() -> None:
+    """A dark collar behind most of the largest ball, a light arm behind the rest."""
+    rng = np.random.default_rng(21)
+    centres = place(rng)
+    canvas = Canvas(320, 240, 140, channels=1)
+    x, y = centres[2]
+
+    def collar(u: Floats, v: Floats) -> NDArray[np.bool_]:
+        return v < y + 6.0 + 0.1 * (u - x)
+
+    def arm(u: Floats, v: Floats) -> NDArray[np.bool_]:
+        return v >= y + 6.0 + 0.1 * (u - x)
+
+    box = (x - 30.0, y - 30.0, x + 30.0, y + 30.0)
+    canvas.paint(45, box, collar, 8)
+    canvas.paint(175, box, arm, 8)
+    for centre, radius in zip(centres, (13.0, 16.0, 20.0), strict=True):
+        canvas.disc(250, centre, radius)
+    found = detect_markers(canvas.image(rng), BY_RADIUS)
+    assert np.abs(found.pixels - centres).max() < 0.1
+
+
 def test_noise_of_the_background_is_in_the_covariance() -> None:
     """What it moves together counts more for the centre than for a finer wave."""
     rng = np.random.default_rng(17)

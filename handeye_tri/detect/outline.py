@@ -65,6 +65,9 @@ _MAX_UNEVEN = 0.08
 _MIN_USABLE = 0.5
 _MAX_HIDDEN = 0.12
 _MAX_ASTRAY = 0.2
+# Levels that differ by less of a marker's usual contrast are the marker's own; what
+# stands behind it, a light arm before a dark one, is farther from it.
+_ALIKE = 0.25
 # Flat dots are seen by up to 60 degrees aslant.
 _MAX_OVAL = 0.6
 _MAX_MISFIT = 0.22
@@ -301,7 +304,8 @@ def _goes_on(
     behind = _ring(sampler, spots, ellipses)[0].mean(axis=2)
     usual = np.median(behind, axis=1, keepdims=True)
     inside = levels[:, None]
-    return np.asarray((np.abs(behind - inside) < np.abs(behind - usual)).mean(axis=1))
+    alike = _ALIKE * np.abs(usual - inside)
+    return np.asarray((np.abs(behind - inside) < alike).mean(axis=1))
 
 
 def _background(
