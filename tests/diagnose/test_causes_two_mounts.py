@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from two_mount_cell import FREE, calibrated, free_covariance, geometry, observed
-from wrong_sessions import moved, with_views
+from wrong_sessions import at_poses, moved, with_views
 
 from handeye_tri.adjustment import joint_offsets
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
@@ -47,16 +47,6 @@ def recorded(session, mounts):
 
 def changed_before(session, station):
     return recorded(session, (np.arange(len(session.stations)) >= station).astype(int))
-
-
-def at_poses(cell, poses):
-    return replace(
-        cell,
-        stations=tuple(
-            replace(station, base_from_flange=SE3(pose))
-            for station, pose in zip(cell.stations, poses, strict=True)
-        ),
-    )
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from wrong_sessions import geometry, moved, observed, told, with_views
+from wrong_sessions import at_poses, geometry, moved, observed, told, with_views
 
 from handeye_tri.adjustment import joint_offsets
 from handeye_tri.diagnose import with_causes
@@ -20,16 +20,6 @@ def codes(findings):
 
 def first_number(text):
     return float(re.search(r"[-+]?\d+\.\d+", text)[0])
-
-
-def at_poses(cell, poses):
-    return replace(
-        cell,
-        stations=tuple(
-            replace(station, base_from_flange=SE3(pose))
-            for station, pose in zip(cell.stations, poses, strict=True)
-        ),
-    )
 
 
 @pytest.mark.parametrize("seed", range(8))

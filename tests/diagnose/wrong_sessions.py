@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handeye_tri.adjustment import adjust
 from handeye_tri.calibrate_cameras import calibrate_session_cameras
@@ -20,6 +21,17 @@ REPEATABILITY = Repeatability(3e-5, float(np.radians(0.005)))
 
 def geometry(seed: int) -> Geometry:
     return reference_geometry(np.random.default_rng([seed, 0]))
+
+
+def at_poses(cell: Geometry, poses: NDArray[np.float64]) -> Geometry:
+    """The cell whose robot reports other poses, shape (n, 4, 4), metres."""
+    return replace(
+        cell,
+        stations=tuple(
+            replace(station, base_from_flange=SE3(pose))
+            for station, pose in zip(cell.stations, poses, strict=True)
+        ),
+    )
 
 
 def observed(seed: int, true: Geometry | None = None) -> Session:
